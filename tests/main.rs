@@ -39,6 +39,8 @@ mod clients;
 mod clients_of_ros2;
 #[path = "stories/commands.rs"]
 mod commands;
+#[path = "stories/cpp.rs"]
+mod cpp;
 #[path = "stories/cross.rs"]
 mod cross;
 #[path = "stories/crossing.rs"]
@@ -122,6 +124,8 @@ mod refusals;
 #[path = "stories/registries.rs"]
 mod registries;
 mod rehearsal;
+#[path = "stories/reported.rs"]
+mod reported;
 #[path = "stories/robot_network.rs"]
 mod robot_network;
 #[path = "stories/rollouts.rs"]
@@ -223,6 +227,7 @@ fn main() -> ExitCode {
             all_that_a_package_forgot_is_named_at_once,
             a_python_module_that_a_package_forgot_is_named,
             a_package_whose_programs_are_not_found_is_refused_at_once,
+            nodes_that_speak_zenoh_are_refused_before_a_build,
             what_to_run_is_asked_for_before_anything_is_compiled,
             a_dependency_is_met_by_a_package_of_another_name,
         ],
@@ -245,6 +250,11 @@ fn main() -> ExitCode {
             who_follows_events_misses_none_when_the_daemon_is_started_again,
             shells_complete_it_and_every_verb_has_a_page,
             top_shows_who_uses_the_machine,
+        ],
+        stories![cpp:
+            a_node_over_rcl_answers_with_types_of_its_workspace,
+            a_library_that_a_parameter_names_is_loaded,
+            a_lifecycle_node_over_rcl_becomes_active,
         ],
         stories![described: every_answer_is_as_the_document_says],
         stories![history: what_servants_did_outlives_them_and_the_daemon],
@@ -277,6 +287,7 @@ fn main() -> ExitCode {
         stories![exec:
             a_shell_at_a_terminal_has_one,
             who_may_not_is_refused_and_who_may_no_longer_is_ended,
+            a_program_ends_with_a_daemon_that_is_killed,
         ],
         of_both![failover:
             a_slow_network_costs_few_requests,
@@ -320,6 +331,7 @@ fn main() -> ExitCode {
             an_exported_service_is_published_on_another_server,
             a_base_is_moved_to_a_server_without_network,
             a_saved_image_becomes_a_base,
+            an_image_of_a_registry_becomes_a_base,
             a_root_file_system_made_by_hand_becomes_a_base,
             what_nobody_refers_to_is_collected,
         ],
@@ -376,9 +388,14 @@ fn main() -> ExitCode {
             stamps_transforms_and_calls_cross,
             an_action_is_carried_out_in_the_other_ros,
             a_node_calls_a_robot_of_the_other_ros,
+            a_node_sends_goals_to_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
             parameters_of_the_node_are_the_robots,
             the_robots_own_original_answers_while_the_cable_is_cut,
+        ],
+        stories![mixed:
+            a_node_of_ros_2_is_reconfigured_by_a_robot_of_ros_1,
+            a_node_of_ros_1_is_reconfigured_by_a_robot_of_ros_2,
         ],
         of_both![crossing:
             stamps_mean_the_same_where_clocks_differ,
@@ -423,6 +440,7 @@ fn main() -> ExitCode {
         ],
         stories![ros2:
             a_workspace_is_pushed_and_asked_by_rosbridge,
+            a_workspace_runs_on_kilted_as_on_jazzy,
             a_prebuilt_space_is_served_with_its_interfaces,
             two_programs_of_several_nodes_have_nodes_of_their_own_names,
             nodes_stay_in_the_namespaces_that_their_programs_give_them,
@@ -514,6 +532,12 @@ fn main() -> ExitCode {
             a_slash_behind_a_service_leads_to_the_same_service,
             a_handshake_that_cannot_be_taken_is_refused_by_what_is_wrong,
         ],
+        of_both![reported:
+            clients_that_subscribe_and_leave_at_once_leave_nothing,
+            clients_that_come_at_once_are_all_answered,
+            a_package_that_nobody_has_is_told_to_who_names_it_alone,
+            json_in_binary_frames_is_read_as_it_comes,
+        ],
         stories![bounds:
             a_build_that_takes_too_much_is_ended_and_leaves_nothing,
             a_push_outlives_its_client,
@@ -559,6 +583,7 @@ fn main() -> ExitCode {
             archives_that_reach_out_of_their_tree,
             reserved_and_taken_names,
             a_full_disk_ends_a_push_and_nothing_else,
+            an_import_of_a_base_leaves_space_on_the_disk,
         ],
         stories![candidates:
             a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it,
@@ -600,6 +625,7 @@ fn main() -> ExitCode {
         stories![survival:
             what_cannot_be_removed_keeps_no_daemon_down,
             a_killed_daemon_loses_nothing,
+            a_daemon_killed_while_a_servant_is_made_gives_it_all_that_it_is_granted,
             a_daemon_that_is_ended_says_why_and_keeps_its_servants,
             a_killed_init_and_a_killed_shim_are_told,
             nodes_end_as_ros_users_know_it,
@@ -611,6 +637,7 @@ fn main() -> ExitCode {
             a_certificate_is_asked_for_and_renewed,
             who_comes_for_something_else_is_answered_no_challenge,
             what_cannot_be_asked_for_is_said_at_the_start,
+            what_it_is_tested_with_ends_with_who_started_it,
         ],
         stories![tls:
             a_robot_works_through_tls,
@@ -623,6 +650,7 @@ fn main() -> ExitCode {
         ],
         stories![telling:
             one_that_fails_once_is_told_again_and_its_world_is_kept,
+            evidence_is_cut_in_the_middle_and_the_oldest_goes_first,
             more_than_two_by_chance_fail_the_run_and_strictly_the_first,
             one_without_an_end_is_named_and_ends_the_run,
             what_the_machine_lacks_is_said_in_a_line,
@@ -652,6 +680,7 @@ fn main() -> ExitCode {
             what_is_not_outsourced_becomes_the_original,
             the_installer_checks_before_it_writes_and_undoes_itself,
             where_the_other_ros_is_set_up_a_stub_is_refused,
+            where_nodes_speak_zenoh_a_stub_is_refused,
             a_stub_that_was_changed_on_its_way_is_not_installed,
             its_nodelets_cannot_be_loaded_on_the_robot,
             stubs_are_served_to_those_who_may_and_say_what_is_lacking,

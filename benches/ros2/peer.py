@@ -1,7 +1,7 @@
 """Nodes of rclpy that bench-ros2 is measured beside.
 
-peer.py ROLE …: says {} when it is ready, then lines of JSON; a line on its standard input asks for one. The roles are those of roles.rs
-and camera.rs, so that each side can be either's.
+peer.py ROLE …: says {} when it is ready, then lines of JSON; a line on its standard input asks for one. The roles are
+those of bus.rs, so that each side can be either's.
 """
 
 import array
@@ -53,6 +53,17 @@ def quantile(values, share):
     return sorted(values)[round((len(values) - 1) * share)] if values else None
 
 
+def exchange(count, once):
+    """Makes as many exchanges after those that warm up, one at a time."""
+    say()
+    times = []
+    for number in range(int(count) + WARM):
+        begun = time.perf_counter()
+        once(number)
+        times.append(time.perf_counter() - begun)
+    micros(times[WARM:])
+
+
 def micros(times):
     say(p50=quantile(times, 0.5) * 1e6, p99=quantile(times, 0.99) * 1e6)
 
@@ -65,7 +76,7 @@ def until(what, patience=15):
 
 
 class Relay:
-    """Brings every ping back, answers calls, ends each goal after one feedback, and publishes beats, so many each second."""
+    """Brings pings back, answers calls, ends goals after one feedback, and publishes beats, so many each second."""
 
     def __init__(self, node, beats="0"):
         pong = node.create_publisher(String, "/pong", 10)
@@ -177,15 +188,12 @@ class Trips(Works):
         until(lambda: self.ping.publish(String(data="first")) or self.came.wait(0.02))
         # The first may come more than once.
         time.sleep(0.2)
-        say()
-        times = []
-        for number in range(int(count) + WARM):
-            self.came.clear()
-            begun = time.perf_counter()
-            self.ping.publish(String(data=f"{TEXT}, {number}"))
-            assert self.came.wait(2), "no pong"
-            times.append(time.perf_counter() - begun)
-        micros(times[WARM:])
+        exchange(count, self.bring_back)
+
+    def bring_back(self, number):
+        self.came.clear()
+        self.ping.publish(String(data=f"{TEXT}, {number}"))
+        assert self.came.wait(2), "no pong"
 
 
 class Calls(Works):
@@ -196,18 +204,12 @@ class Calls(Works):
 
     def work(self, count):
         assert self.client.wait_for_service(15), "no server"
-        say()
-        times = []
-        for _ in range(int(count) + WARM):
-            begun = time.perf_counter()
-            self.client.call(SetBool.Request(data=True))
-            times.append(time.perf_counter() - begun)
-        micros(times[WARM:])
+        exchange(count, lambda number: self.client.call(SetBool.Request(data=True)))
 
 
 class Goals:
-    """Goals from their sending to their result, one at a time. All in the executor's thread: a response that is quicker than the thread that
-    sends a goal is taken for another client's."""
+    """Goals from their sending to their result, one at a time. All in the executor's thread: a response that is quicker
+    than the thread that sends a goal is taken for another client's."""
 
     def __init__(self, node, count):
         group = ReentrantCallbackGroup()

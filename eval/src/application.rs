@@ -1,15 +1,12 @@
 //! A robot application that was not written for this evaluation: `rosbag play` and `rosbag record` from Debian's
 //! packages, in the robot's own file system. One plays the recording, the other records the answers.
 
-use std::fs::File;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use bytes::Bytes;
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
+use nix::sys::signal::Signal;
 use sha2::{Digest, Sha256};
 use support::machine;
 use support::site::{NodeProcess, Site};
@@ -26,8 +23,6 @@ const FILES: [&str; 2] = [PLAY, RECORD];
 const CONNECT: &str = "4";
 /// Time without an answer after which none is expected any more.
 const SILENCE: Duration = Duration::from_secs(2);
-/// Maximum time for a program to exit after it was asked to.
-const END: Duration = Duration::from_secs(30);
 const LOOK: Duration = Duration::from_millis(20);
 
 /// Returns the programs' files with their SHA-256. Builds the robots' file system if it does not exist, which needs the
@@ -51,7 +46,7 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
     let begun = Instant::now();
     let bystander = site.node("/bystander")?;
     let mut heard = site.subscribe(&bystander, &plan.answer)?;
-    let mut record = RosbagProgram::start(site, place.path(), RECORD, &["-O", "/mnt/heard.bag", &plan.answer])?;
+    let record = start_program(site, place.path(), RECORD, &["-O", "/mnt/heard.bag", &plan.answer])?;
     site.wait_for_graph(&bystander, "a node that answers, and a recorder", |graph| {
         let ends = graph.topics.get(&*plan.answer);
         ends.is_some_and(|ends| !ends.publishers.is_empty() && ends.subscribers.len() > 1)
@@ -62,9 +57,9 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
     words.extend(["--delay", CONNECT]);
     words.extend(["--bags=/mnt/recording.bag", "--topics", &plan.request]);
     words.extend(plan.besides.iter().map(String::as_str));
-    let mut play = RosbagProgram::start(site, place.path(), PLAY, &words)?;
+    let play = start_program(site, place.path(), PLAY, &words)?;
     let patience = Duration::from_secs_f64(plan.patience);
-    while !play.has_ended()? {
+    while !has_ended(&play) {
         ensure!(
             begun.elapsed() < patience && !has_ended(node),
             "{PLAY} is not done after {:.0} s: {}",
@@ -73,9 +68,12 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
         );
         std::thread::sleep(LOOK);
     }
+    expect_success(play)?;
     while site.next_message_within(&mut heard, SILENCE)?.is_some() {}
-    record.stop()?;
-    let file = Bytes::from(std::fs::read(shared.join("heard.bag")).with_context(|| record.output())?);
+    // As Ctrl-C does.
+    record.signal(Signal::SIGINT)?;
+    expect_success(record)?;
+    let file = Bytes::from(std::fs::read(shared.join("heard.bag")).context("the recorded answers")?);
     let messages = ros::bag::read(&file, usize::MAX)?;
     let first = messages.first().map_or(0, |message| message.time);
     let answer = |message: &ros::bag::BagMessage| {
@@ -95,71 +93,24 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
     })
 }
 
-/// A program in the robots' file system, which is read-only to it; `/mnt` is shared with other programs.
-struct RosbagProgram {
-    child: Child,
-    log: PathBuf,
+/// Starts a program in the robots' file system, which is read-only to it; `/mnt` is shared with other programs.
+fn start_program(site: &Site, place: &Path, program: &str, words: &[&str]) -> Result<NodeProcess> {
+    let root = place.join(program.rsplit('/').next().unwrap_or(program));
+    std::fs::create_dir(&root)?;
+    let script = format!(
+        "mount --bind {base} {root} && mount -o remount,bind,ro {root} && mount --rbind /dev {root}/dev && mount -t \
+         proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && mount --bind \
+         {shared} {root}/mnt && exec chroot {root} \"$@\"",
+        base = machine::base()?.display(),
+        root = root.display(),
+        shared = place.join("shared").display(),
+    );
+    site.start_in_image(&script, program, &words.iter().map(|word| (*word).to_owned()).collect::<Vec<_>>())
 }
 
-impl RosbagProgram {
-    fn start(site: &Site, place: &Path, program: &str, words: &[&str]) -> Result<Self> {
-        let name = program.rsplit('/').next().unwrap_or(program);
-        let (root, log) = (place.join(name), place.join(format!("{name}.log")));
-        std::fs::create_dir(&root)?;
-        let script = format!(
-            "mount --bind {base} {root} && mount -o remount,bind,ro {root} && mount --rbind /dev {root}/dev && mount \
-             -t proc proc {root}/proc \
-             && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && mount --bind {shared} {root}/mnt \
-             && exec chroot {root} \"$@\"",
-            base = machine::base()?.display(),
-            root = root.display(),
-            shared = place.join("shared").display(),
-        );
-        let said = File::create(&log)?;
-        let child = Command::new("unshare")
-            .args(["--mount", "sh", "-c", &script, "sh", program])
-            .args(words)
-            .env("HOME", "/root")
-            .env("ROS_IP", "127.0.0.1")
-            .env("ROS_MASTER_URI", format!("http://{}", site.master()?))
-            .stdin(Stdio::null())
-            .stdout(said.try_clone()?)
-            .stderr(said)
-            .spawn()
-            .context("unshare, of util-linux")?;
-        Ok(Self { child, log })
-    }
-
-    fn output(&self) -> String {
-        std::fs::read_to_string(&self.log).unwrap_or_default()
-    }
-
-    /// Returns whether it has exited; fails if it exited with an error.
-    fn has_ended(&mut self) -> Result<bool> {
-        match self.child.try_wait()? {
-            Some(status) => {
-                ensure!(status.success(), "{status}: {}", self.output());
-                Ok(true)
-            }
-            None => Ok(false),
-        }
-    }
-
-    /// Sends SIGINT, as Ctrl-C does, and waits for its end.
-    fn stop(&mut self) -> Result<()> {
-        kill(Pid::from_raw(self.child.id() as i32), Signal::SIGINT)?;
-        let begun = Instant::now();
-        while !self.has_ended()? {
-            ensure!(begun.elapsed() < END, "it does not end: {}", self.output());
-            std::thread::sleep(LOOK);
-        }
-        Ok(())
-    }
-}
-
-impl Drop for RosbagProgram {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// Waits for the end of a program, which must succeed.
+fn expect_success(mut program: NodeProcess) -> Result<()> {
+    let status = program.wait_for_exit()?;
+    ensure!(status.success(), "{status}: {}", program.output());
+    Ok(())
 }

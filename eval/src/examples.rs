@@ -2,11 +2,13 @@
 
 mod packages;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use sha2::{Digest, Sha256};
 use support::binaries;
 use support::daemon::Daemon;
@@ -14,23 +16,21 @@ use support::site::{image_config, image_shell};
 use tempfile::TempDir;
 
 use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
-use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
-use crate::stereo;
+use crate::robot::{NodeUnderTest, RobotPlan};
 use crate::trace::Trace;
-use crate::weights;
-use crate::{attempts, deadline};
+use crate::{deadline, pictures};
 
 pub use packages::{
-    ALL, DETECTOR, DISPARITY, EvalPackage, GRAPH_SLAM, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED, Origin, PEOPLE,
+    ALL, DETECTOR, DISPARITY, EvalPackage, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED, Origin, PEOPLE,
 };
-use packages::{DATA, DRIVE, SIMULATED, VIDEO};
+use packages::{DATA, DRIVE, SIMULATED};
 
 /// Directory of compiled packages in images.
 const COMPILED: &str = "/opt/cloudroid/install/lib";
 /// Directory of Debian's packages in images.
 const PACKAGED: &str = "/usr/lib";
-/// Seconds after which a request counts as unanswered.
-const GIVE_UP: f64 = 30.0;
+/// Maximum time to fetch some tens of megabytes.
+const FETCHES: Duration = Duration::from_secs(600);
 /// Maximum time to create one recording.
 const CONVERTS: Duration = Duration::from_secs(300);
 /// File that the converter writes.
@@ -39,15 +39,12 @@ const BAG: &str = "recording.bag";
 /// Place where an example runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExecutionSite {
-    /// On the robot.
     Native,
-    /// In a servant, through the stub.
     Outsourced,
 }
 
 /// Services, root file systems and recordings that are created once and shared by runs.
 pub struct EvalFixtures<'a> {
-    /// The daemon that has the services.
     pub daemon: &'a Daemon,
     place: &'a Path,
 }
@@ -60,23 +57,17 @@ impl<'a> EvalFixtures<'a> {
 
     /// Publishes an example, unless it has been published, or has failed, before.
     pub fn publish(&self, example: &EvalPackage) -> Result<()> {
-        let services = self.daemon.deployer().run_json(&["services"])?;
-        let known = services.as_array().is_some_and(|all| all.iter().any(|service| service["name"] == example.name));
-        if known {
-            return Ok(());
-        }
-        attempts::try_once(example.name, || self.push(example))
+        publish_once(self.daemon, example.name, || self.push(example))
     }
 
     fn push(&self, example: &EvalPackage) -> Result<()> {
-        eprintln!("pushing {}: the first time takes some minutes", example.name);
         example.input.check_files()?;
         let mut push = vec!["push".to_owned()];
         match example.origin {
             Origin::Checkout => {
                 let package = binaries::checkout().join("examples").join(example.name);
                 if example.name == DETECTOR.name {
-                    weights::install(&package)?;
+                    fetch_weights(&package)?;
                 }
                 push.push(package.to_str().context("a path of UTF-8")?.to_owned());
             }
@@ -96,7 +87,6 @@ impl<'a> EvalFixtures<'a> {
         Ok(())
     }
 
-    /// Creates a temporary directory for one run.
     pub fn directory(&self) -> Result<TempDir> {
         Ok(tempfile::Builder::new().prefix("run-").tempdir_in(self.place)?)
     }
@@ -136,26 +126,15 @@ impl<'a> EvalFixtures<'a> {
                 environment: Vec::new(),
             },
         };
+        let is_drive = matches!(example.input, InputRecording::Drive | InputRecording::Simulated);
         Ok(RobotPlan {
-            server: String::new(),
-            node,
-            recording: self.recording(example.input)?,
-            request: example.request.to_owned(),
             left_out: vec!["/ground_truth".to_owned()],
-            besides: match example.input {
-                InputRecording::Drive | InputRecording::Simulated => vec!["/odom".to_owned()],
-                InputRecording::Pictures | InputRecording::Stereo => Vec::new(),
-            },
-            answer: example.answer.to_owned(),
-            tells_pose: matches!(example.input, InputRecording::Drive | InputRecording::Simulated),
+            besides: if is_drive { vec!["/odom".to_owned()] } else { Vec::new() },
+            tells_pose: is_drive,
             timing: example.timing.map(str::to_owned),
             map: example.map.map(str::to_owned),
-            pace: RequestPacing::OneByOne,
-            every: 1,
             most: example.requests,
-            give_up: GIVE_UP,
-            patience: 600.0,
-            changes: Vec::new(),
+            ..RobotPlan::new(node, self.recording(example.input)?, example.request, example.answer)
         })
     }
 
@@ -180,16 +159,16 @@ impl<'a> EvalFixtures<'a> {
         let path = self.place.join(match input {
             InputRecording::Drive => "drive.bag",
             InputRecording::Simulated => "simulated.bag",
-            InputRecording::Pictures => "pedestrians.raw",
-            InputRecording::Stereo => "plant.stereo",
+            InputRecording::Pictures => "pedestrians.messages",
+            InputRecording::Stereo => "plant.messages",
         });
         if !path.exists() {
             let half = path.with_extension("half");
             match input {
                 InputRecording::Drive => self.convert_rawlog(DRIVE, &half)?,
                 InputRecording::Simulated => self.convert_rawlog(SIMULATED, &half)?,
-                InputRecording::Pictures => extract_pictures(&half)?,
-                InputRecording::Stereo => stereo::write(&half)?,
+                InputRecording::Pictures => pictures::write_video(&half)?,
+                InputRecording::Stereo => pictures::write_stereo(&half)?,
             }
             std::fs::rename(half, &path)?;
         }
@@ -225,6 +204,39 @@ impl<'a> EvalFixtures<'a> {
     }
 }
 
+/// Fetches the trained weights of the detector, unless this user has them.
+fn fetch_weights(package: &Path) -> Result<()> {
+    let script = package.join("fetch_weights");
+    let mut child = Command::new(&script).stdout(Stdio::null()).spawn().context("fetch_weights")?;
+    let status = deadline::wait_for_exit(&mut child, "fetch_weights", FETCHES)?;
+    let how = "which takes them from the registry of npm";
+    ensure!(
+        status.success(),
+        "the detector's weights could not be fetched ({status}): run {}, {how}",
+        script.display()
+    );
+    Ok(())
+}
+
+/// Errors of pushes that have failed in this run of the evaluation, by the name of the service: a push takes minutes.
+static FAILED: Mutex<BTreeMap<String, String>> = Mutex::new(BTreeMap::new());
+
+/// Publishes a service by `push`, unless it has been published, or has failed, before.
+pub fn publish_once(daemon: &Daemon, name: &str, push: impl FnOnce() -> Result<()>) -> Result<()> {
+    let services = daemon.deployer().run_json(&["services"])?;
+    if services.as_array().is_some_and(|all| all.iter().any(|service| service["name"] == name)) {
+        return Ok(());
+    }
+    let failed = || FAILED.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(why) = failed().get(name) {
+        bail!("{why} (it failed before in this run and was not tried again)");
+    }
+    eprintln!("pushing {name}: the first time may take some minutes");
+    push().inspect_err(|error| {
+        failed().insert(name.to_owned(), format!("{error:#}"));
+    })
+}
+
 /// Returns the SHA-256 of the packages' sources, so that results of other versions are not mistaken for results of
 /// these.
 pub fn fingerprint() -> Result<String> {
@@ -252,17 +264,4 @@ pub fn fingerprint() -> Result<String> {
         }
     }
     Ok(format!("{:x}", whole.finalize()))
-}
-
-/// Extracts images of pedestrians from opencv-doc: 640x480, bgr8, concatenated.
-fn extract_pictures(to: &Path) -> Result<()> {
-    let mut child = Command::new("ffmpeg")
-        .args(["-v", "error", "-i", VIDEO, "-vf", "scale=640:480"])
-        .args(["-frames:v", "60", "-pix_fmt", "bgr24", "-f", "rawvideo", "-y"])
-        .arg(to)
-        .spawn()
-        .context("ffmpeg")?;
-    let status = deadline::wait_for_exit(&mut child, "ffmpeg", CONVERTS)?;
-    ensure!(status.success(), "ffmpeg ended with {status}");
-    Ok(())
 }

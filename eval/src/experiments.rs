@@ -1,6 +1,5 @@
 //! The experiments, one file each: how they are measured, and their sections of the report.
 
-pub mod benches;
 pub mod codecs;
 pub mod cores;
 pub mod crowd;

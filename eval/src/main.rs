@@ -1,6 +1,37 @@
 //! `make eval`: runs the published experiments on one machine with real nodes and writes a report. Needs root.
+//!
+//! ```text
+//!  experiments ── run ──▶ results (target/eval/cells: raw data, one file per run)
+//!                            │ evaluated by functions that are tested with known input
+//!                            ▼
+//!                         sections ──▶ report.html, report.json, one SVG per figure
+//! ```
+//! An interrupted evaluation continues where it stopped. The report lists what could not be measured, with the reason.
 
 #![forbid(unsafe_code)]
+
+mod application;
+mod basis;
+mod cells;
+mod deadline;
+mod examples;
+mod experiments;
+mod interrupt;
+mod network;
+mod page;
+mod pictures;
+mod place;
+mod plots;
+mod recording;
+mod rehearsal;
+mod report;
+mod robot;
+mod section;
+mod statistics;
+mod stream;
+mod sweep;
+mod trace;
+mod words;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -10,12 +41,13 @@ use clap::{Parser, Subcommand};
 use support::claim;
 use support::daemon::DaemonSetup;
 
-use eval::cells::RunCache;
-use eval::examples::EvalFixtures;
-use eval::experiments::crowd::CrowdDaemon;
-use eval::experiments::{codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency};
-use eval::section::{MissingMeasurement, Section};
-use eval::{basis, interrupt, rehearsal, report, robot, sweep};
+use crate::cells::{REPEATS, RunCache};
+use crate::examples::EvalFixtures;
+use crate::experiments::crowd::CrowdDaemon;
+use crate::experiments::{
+    codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
+};
+use crate::section::{AGAIN, About, Section};
 
 /// Requests per run of a quick evaluation.
 const QUICK: usize = 6;
@@ -30,19 +62,18 @@ struct Evaluation<'a> {
 
 impl Evaluation<'_> {
     /// Returns the maximum number of requests per run.
-    fn most(&self) -> Option<usize> {
+    fn max_requests(&self) -> Option<usize> {
         self.quick.then_some(QUICK)
     }
 }
 
 /// Experiments that are measured together.
 struct Experiment {
-    /// Their numbers.
-    numbers: &'static [u8],
+    abouts: &'static [&'static About],
     /// Seconds of a quick and of a full evaluation, on a machine with two cores and with packages compiled earlier.
     seconds: [u32; 2],
-    /// Id, title and the tests that cover the same, if a quick evaluation omits it unless it is named.
-    left_out: Option<[&'static str; 3]>,
+    /// The tests that cover the same, if a quick evaluation omits it unless it is named.
+    covered_by: Option<&'static str>,
     /// Measures them, and creates their sections.
     run: fn(&mut Evaluation) -> Result<Vec<Section>>,
 }
@@ -50,108 +81,79 @@ struct Experiment {
 /// All experiments.
 static EXPERIMENTS: [Experiment; 10] = [
     Experiment {
-        numbers: &[1],
+        abouts: &[&transparency::ABOUT],
         seconds: [55, 300],
-        left_out: None,
+        covered_by: None,
         run: |all| {
-            let runs = transparency::measure(all.cells, all.workshop, all.most())?;
-            Ok(vec![transparency::section(&runs)])
+            Ok(vec![transparency::section(&transparency::measure(all.cells, all.workshop, all.max_requests())?)])
         },
     },
     Experiment {
-        numbers: &[2, 4, 5],
-        // With that of cores.
-        seconds: [20, 540],
-        left_out: None,
+        abouts: &[&outsourcing::RESPONSE_TIMES, &outsourcing::PHASES, &outsourcing::JITTER],
+        seconds: [20, 1600],
+        covered_by: None,
         run: |all| {
-            let runs = outsourcing::measure(all.cells, all.workshop, all.most())?;
-            Ok(vec![outsourcing::response_times(&runs)?, outsourcing::phases(&runs)?, outsourcing::jitter(&runs)?])
+            let runs = outsourcing::measure(all.cells, all.workshop, all.max_requests())?;
+            Ok(vec![outsourcing::response_times(&runs), outsourcing::phases(&runs), outsourcing::jitter(&runs)])
         },
     },
     Experiment {
-        numbers: &[2],
+        abouts: &[&cores::ABOUT],
         seconds: [0, 0],
-        left_out: None,
+        covered_by: None,
+        run: |all| Ok(vec![cores::section(&cores::measure(all.cells, all.workshop, all.quick)?)]),
+    },
+    Experiment {
+        abouts: &[&memory::ABOUT],
+        seconds: [60, 180],
+        covered_by: Some("the stories eval and isolation"),
+        run: |all| Ok(vec![memory::section(&memory::measure(all.cells, all.workshop)?)]),
+    },
+    Experiment {
+        abouts: &[&failover::ABOUT],
+        seconds: [30, 1200],
+        covered_by: Some("the stories failover and fallback"),
+        run: |all| Ok(vec![failover::section(&failover::measure(all.cells, all.workshop, all.quick)?)]),
+    },
+    Experiment {
+        abouts: &[&map::ABOUT],
+        seconds: [10, 1100],
+        covered_by: None,
         run: |all| {
-            let studies = cores::measure(all.cells, all.workshop, all.quick)?;
-            Ok(vec![cores::section(&studies)?])
+            Ok(vec![map::section(&map::measure(all.cells, all.workshop, all.max_requests().map(|most| most * 5))?)])
         },
     },
     Experiment {
-        numbers: &[3],
-        seconds: [60, 60],
-        left_out: Some([
-            "memory",
-            "A package that needs more memory than the robot has",
-            "the stories eval and isolation",
-        ]),
-        run: |all| {
-            let runs = memory::measure(all.cells, all.workshop)?;
-            Ok(vec![memory::section(&runs)])
-        },
+        abouts: &[&codecs::ABOUT],
+        seconds: [20, 1250],
+        covered_by: None,
+        run: |all| Ok(vec![codecs::section(&codecs::measure(all.cells, all.workshop, all.quick)?)]),
     },
     Experiment {
-        numbers: &[6],
-        seconds: [30, 390],
-        left_out: Some(["failover", "A network that becomes bad", "the stories failover and fallback"]),
-        run: |all| {
-            let runs = failover::measure(all.cells, all.workshop, all.quick)?;
-            Ok(vec![failover::section(&runs)?])
-        },
+        abouts: &[&neighbours::ABOUT],
+        seconds: [20, 1500],
+        covered_by: Some("the stories limits and sla of the virtual machine"),
+        run: |all| Ok(vec![neighbours::section(&neighbours::measure(all.cells, &mut all.crowd, all.quick)?)]),
     },
     Experiment {
-        numbers: &[7],
-        seconds: [10, 365],
-        left_out: None,
-        run: |all| {
-            let most = all.most().map(|most| most * 5);
-            let runs = map::measure(all.cells, all.workshop, most)?;
-            Ok(vec![map::section(&runs)?])
-        },
+        abouts: &[&scale::ABOUT],
+        seconds: [15, 330],
+        covered_by: None,
+        run: |all| Ok(vec![scale::section(&scale::measure(all.cells, &mut all.crowd, all.quick)?)]),
     },
     Experiment {
-        numbers: &[8],
-        seconds: [20, 420],
-        left_out: None,
-        run: |all| {
-            let runs = codecs::measure(all.cells, all.workshop, all.quick)?;
-            Ok(vec![codecs::section(&runs)?])
-        },
-    },
-    Experiment {
-        numbers: &[9],
-        seconds: [20, 500],
-        left_out: Some(["neighbours", "Robots beside each other", "the stories limits and sla of the virtual machine"]),
-        run: |all| {
-            let runs = neighbours::measure(all.cells, &mut all.crowd, all.quick)?;
-            Ok(vec![neighbours::section(&runs)?])
-        },
-    },
-    Experiment {
-        numbers: &[10],
-        seconds: [15, 110],
-        left_out: None,
-        run: |all| {
-            let runs = scale::measure(all.cells, &mut all.crowd, all.quick)?;
-            Ok(vec![scale::section(&runs)?])
-        },
-    },
-    Experiment {
-        numbers: &[11],
-        seconds: [0, 300],
-        left_out: Some(["overhead", "What the system itself adds", "benches/servant, benches/portal and benches/link"]),
-        run: |all| {
-            let runs = overhead::measure(all.cells)?;
-            Ok(vec![overhead::section(&runs)?])
-        },
+        abouts: &[&overhead::ABOUT],
+        seconds: [0, 900],
+        covered_by: Some("benches/servant, benches/portal and benches/link"),
+        run: |all| Ok(vec![overhead::section(&overhead::measure(all.cells)?)]),
     },
 ];
 
 /// Run the published experiments on this machine and write target/eval/report.html
 #[derive(Debug, Parser)]
 struct EvalArguments {
-    /// Run a reduced evaluation of about two minutes: few requests per run, without the experiments that stories cover
-    /// (unless named by --only)
+    /// Run a reduced evaluation of about two minutes: one run of few requests each, without the experiments that
+    /// stories cover (unless named by --only)
     #[arg(long)]
     quick: bool,
     /// Run only these experiments, such as 1,4,7 (default: all)
@@ -192,8 +194,7 @@ fn main() -> ExitCode {
         _ => evaluate(&arguments),
     };
     match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
+        Ok(is_complete) => ExitCode::from(u8::from(!is_complete)),
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
@@ -208,8 +209,8 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
         let name = if arguments.quick { "eval-quick" } else { "eval" };
         bench_report::root().join("target").join(name)
     });
-    let cells = RunCache::new(target.join("cells"), arguments.fresh)?;
-    let cells = cells.with_basis(basis::basis()?);
+    let repeats = if arguments.quick { 1 } else { REPEATS };
+    let cells = RunCache::new(target.join("cells"), arguments.fresh, basis::basis()?, repeats)?;
     interrupt::listen()?;
     for line in sweep::remove_all() {
         eprintln!("left by an evaluation before: {line}");
@@ -219,18 +220,11 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
     let daemon = DaemonSetup::new(&place.path().join("home")).start()?;
     let workshop = EvalFixtures::new(&daemon, place.path());
     let sections = match &arguments.verb {
-        Some(EvalCommand::Rehearse { seconds }) => {
-            vec![rehearsal::section(&cells, &workshop, *seconds)?]
-        }
+        Some(EvalCommand::Rehearse { seconds }) => vec![rehearsal::section(&cells, &workshop, *seconds)?],
         _ => {
             let directory = workshop.directory()?;
-            let evaluation = Evaluation {
-                cells: &cells,
-                workshop: &workshop,
-                crowd: CrowdDaemon::new(directory.path()),
-                quick: arguments.quick,
-            };
-            run_experiments(arguments, evaluation)
+            let crowd = CrowdDaemon::new(directory.path());
+            run_experiments(arguments, Evaluation { cells: &cells, workshop: &workshop, crowd, quick: arguments.quick })
         }
     };
     // Written before the daemon is stopped, so that a failure there does not lose the results.
@@ -243,45 +237,38 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
 /// covered. If an experiment fails as a whole, a section has the reason, and the others continue.
 fn run_experiments(arguments: &EvalArguments, mut evaluation: Evaluation) -> Vec<Section> {
     let quick = evaluation.quick;
-    let is_wanted = |number: &u8| arguments.only.is_empty() || arguments.only.contains(number);
-    let is_omitted = |one: &Experiment| quick && arguments.only.is_empty() && one.left_out.is_some();
-    let wanted = EXPERIMENTS.iter().filter(|one| one.numbers.iter().any(is_wanted));
+    let is_wanted = |number: u8| arguments.only.is_empty() || arguments.only.contains(&number);
+    let wanted = EXPERIMENTS.iter().filter(|one| one.abouts.iter().any(|about| is_wanted(about.number)));
+    let is_omitted = |one: &Experiment| quick && arguments.only.is_empty() && one.covered_by.is_some();
     let (omitted, wanted): (Vec<&Experiment>, Vec<_>) = wanted.partition(|one| is_omitted(one));
     let seconds = wanted.iter().map(|one| one.seconds[usize::from(!quick)]);
     eprintln!(
         "this takes about {} min on a machine of two cores, less what was measured before; packages that were never \
-         compiled take some minutes more",
+         compiled take some minutes more\nmin:s  run",
         seconds.sum::<u32>().div_ceil(60)
     );
-    eprintln!("min:s  run");
     let mut sections = Vec::new();
     for one in wanted {
         match (one.run)(&mut evaluation) {
-            Ok(made) => sections.extend(made.into_iter().filter(|made| is_wanted(&made.number))),
+            Ok(made) => sections.extend(made.into_iter().filter(|made| is_wanted(made.number))),
             Err(error) => {
-                let numbers = one.numbers.iter().copied().filter(is_wanted);
-                sections.extend(numbers.take(1).map(|number| failure_section(number, &error)));
+                let failed = one.abouts.iter().find(|about| is_wanted(about.number));
+                sections.extend(failed.map(|about| {
+                    let mut section = about.section();
+                    section.add_missing("the whole experiment", format!("{error:#}"), AGAIN);
+                    section
+                }));
             }
         }
     }
-    for one in omitted {
-        if let Some([id, title, covered]) = one.left_out {
-            let mut section = Section::new(one.numbers[0], id, title);
-            section.findings.push(format!(
-                "A quick evaluation leaves this out: {covered} run the same of the programs. make eval measures it."
-            ));
-            sections.push(section);
-        }
-    }
+    sections.extend(omitted.into_iter().map(|one| {
+        let mut section = one.abouts[0].section();
+        let covered = one.covered_by.unwrap_or_default();
+        section.findings.push(format!(
+            "A quick evaluation leaves this out: {covered} run the same of the programs. make eval measures it."
+        ));
+        section
+    }));
     sections.sort_by_key(|section| section.number);
     sections
-}
-
-/// Creates the section of an experiment that failed as a whole.
-fn failure_section(number: u8, error: &anyhow::Error) -> Section {
-    let title = format!("Experiment {number}");
-    let mut section = Section::new(number, format!("failed-{number}"), title);
-    let why = format!("{error:#}");
-    section.missing.push(MissingMeasurement::retryable("the whole experiment", why));
-    section
 }

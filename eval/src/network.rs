@@ -18,10 +18,8 @@ pub enum NetworkProfile {
 }
 
 impl NetworkProfile {
-    /// All networks.
     pub const ALL: [Self; 4] = [Self::Lan, Self::Wan, Self::Wifi, Self::Bad];
 
-    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Lan => "LAN",
@@ -31,7 +29,6 @@ impl NetworkProfile {
         }
     }
 
-    /// Properties of the network, for each direction.
     pub fn rules(self) -> NetworkImpairment {
         let (rate, delay, jitter, loss) = match self {
             Self::Lan => (100_000, 1, 0, 0.0),
@@ -42,7 +39,6 @@ impl NetworkProfile {
         NetworkImpairment { rate, delay, jitter, loss, limit: if self == Self::Bad { 100 } else { 1000 } }
     }
 
-    /// Describes its properties in words.
     pub fn describe(self) -> String {
         let rules = self.rules();
         let mut told = format!("{} ms each way", rules.delay);

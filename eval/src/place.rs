@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
@@ -31,7 +31,6 @@ const DONE: &str = "done";
 /// A class of robot computers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RobotHardware {
-    /// Cores of this machine.
     pub cores: f64,
     /// Memory in bytes.
     pub memory: u64,
@@ -43,7 +42,6 @@ impl RobotHardware {
     /// An ultrabook: half a core and 4 GiB.
     pub const ULTRABOOK: Self = Self { cores: 0.5, memory: 4 * GIB };
 
-    /// Name in tables.
     pub fn name(self) -> &'static str {
         if self == Self::PI { "Pi" } else { "ultrabook" }
     }
@@ -54,23 +52,17 @@ impl RobotHardware {
 pub struct RunCost {
     /// Processor time of all processes on the robot, in seconds.
     pub robot_cpu: f64,
-    /// Bytes of packets from the robot.
     pub sent: u64,
-    /// Bytes of packets to the robot.
     pub received: u64,
     /// Number of the robot's processes that the kernel's OOM killer ended.
     pub killed_for_memory: u64,
-    /// Mechanism that shapes the network.
     pub network: String,
 }
 
 /// The sandbox of a robot. Its processes end on drop.
 pub struct RobotSandbox {
-    /// Leads to the server from inside.
     cable: Cable,
     cgroup: Cgroup,
-    /// Program of the robot: this executable, unless a test sets another one.
-    pub program: PathBuf,
 }
 
 impl RobotSandbox {
@@ -89,13 +81,8 @@ impl RobotSandbox {
         let name = cable.namespace();
         let name = name.file_name().and_then(|name| name.to_str());
         let cgroup = Cgroup::for_servant(&parent, &spec(name.unwrap_or("robot"), &limits));
-        cgroup.create()?;
-        let place = Self {
-            cable,
-            cgroup,
-            // Through the process, because the file may have been replaced meanwhile.
-            program: format!("/proc/{}/exe", std::process::id()).into(),
-        };
+        cgroup.create().context("control groups, which a robot's place needs")?;
+        let place = Self { cable, cgroup };
         let now = place.cgroup.set_limits(&limits).limits;
         let cores = now.cpus.unwrap_or(f64::INFINITY);
         ensure!(
@@ -134,7 +121,8 @@ impl RobotSandbox {
         let mut child = Command::new("nsenter")
             .arg(format!("--net={}", self.cable.namespace().display()))
             .arg("--")
-            .arg(&self.program)
+            // Through the process, because the file may have been replaced meanwhile.
+            .arg(format!("/proc/{}/exe", std::process::id()))
             .arg("robot")
             .args([&order, &answer])
             // Leftovers of a killed robot are removed together with the run's directory.
@@ -238,7 +226,6 @@ fn wait_for_robot(child: &mut Child, patience: Duration) -> Result<()> {
     }
 }
 
-/// Returns the end of the output in one line.
 fn output_tail(said: &str) -> String {
     let lines: Vec<&str> = said.lines().filter(|line| !line.trim().is_empty()).collect();
     let from = lines.len().saturating_sub(6);

@@ -1,58 +1,37 @@
 //! Recorded inputs that a robot plays: the messages of one topic are its requests, all others accompany them.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use bytes::{Buf, Bytes};
 use ros::bag::{self, BagMessage};
 
-use crate::{stereo, stream};
+use crate::stream;
 
-/// Size of the images.
-const SIZE: (u32, u32) = (640, 480);
-/// Bytes of such an image.
-pub const PICTURE: usize = (SIZE.0 * SIZE.1 * 3) as usize;
-/// Interval between two images, in nanoseconds.
-const PERIOD: u64 = 100_000_000;
 const SECOND: u64 = 1_000_000_000;
 
 /// A recording in memory.
 #[derive(Debug, Clone)]
 pub struct Recording {
-    /// Messages in the order of their times.
     messages: Vec<BagMessage>,
 }
 
 /// A request, and the other messages recorded since the previous request.
 pub struct RecordedStep<'a> {
-    /// Messages of other topics.
     pub before: Vec<&'a BagMessage>,
-    /// The request.
     pub request: &'a BagMessage,
     /// Seconds since the first message of the recording.
     pub at: f64,
 }
 
 impl Recording {
-    /// Reads an uncompressed rosbag file, a file of [`stream`] with the extension `.messages`, one of [`stereo`] with
-    /// the extension `.stereo`, or a file with the extension `.raw`: concatenated images of 640x480, bgr8, played at
-    /// ten per second.
+    /// Reads an uncompressed rosbag file, or a file of [`stream`].
     pub fn read(path: &Path) -> Result<Self> {
         let named = || path.display().to_string();
         let file = Bytes::from(std::fs::read(path).with_context(named)?);
-        if path.extension().is_some_and(|ending| ending == "raw") {
-            return Ok(from_pictures(&file));
-        }
-        if path.extension().is_some_and(|ending| ending == "messages") {
-            let messages = stream::read(&file).with_context(named)?;
-            return Ok(Self { messages });
-        }
-        if path.extension().is_some_and(|ending| ending == "stereo") {
-            let messages = stereo::read(&file);
-            return Ok(Self { messages });
-        }
-        let mut messages = bag::read(&file, usize::MAX).with_context(named)?;
+        let is_stream = path.extension().is_some_and(|ending| ending == stream::EXTENSION);
+        let read = if is_stream { stream::read(&file) } else { bag::read(&file, usize::MAX).map_err(Into::into) };
+        let mut messages = read.with_context(named)?;
         messages.sort_by_key(|message| message.time);
         ensure!(!messages.is_empty(), "{}: no message is in it", named());
         Ok(Self { messages })
@@ -99,27 +78,6 @@ impl Recording {
         };
         of.filter_map(position).collect()
     }
-
-    /// Creates a recording of these messages.
-    #[cfg(test)]
-    pub fn from_messages(messages: Vec<BagMessage>) -> Self {
-        Self { messages }
-    }
-}
-
-/// Creates a recording of images.
-fn from_pictures(file: &Bytes) -> Recording {
-    let (width, height) = SIZE;
-    let topic: Arc<str> = Arc::from("/image");
-    let wire_type = Arc::new(support::people::image_type());
-    let pictures = file.chunks_exact((width * height * 3) as usize);
-    let messages = pictures.zip(0..).map(|(pixels, number)| BagMessage {
-        topic: topic.clone(),
-        wire_type: wire_type.clone(),
-        time: u64::from(number) * PERIOD,
-        bytes: support::people::picture(number, SIZE, pixels),
-    });
-    Recording { messages: messages.collect() }
 }
 
 /// The `std_msgs/Header` at the beginning of a serialized message.
@@ -127,7 +85,6 @@ fn from_pictures(file: &Bytes) -> Recording {
 pub struct Header {
     /// Seconds and nanoseconds.
     pub stamp: (u32, u32),
-    /// Offset of the byte after the header.
     pub end: usize,
 }
 
@@ -185,20 +142,16 @@ fn set_stamp(bytes: &Bytes, (seconds, nanoseconds): (u32, u32)) -> Option<Bytes>
     Some(message.into())
 }
 
-/// Creates a message for tests.
-#[cfg(test)]
-pub fn test_message(topic: &str, seconds: u64, bytes: &[u8]) -> BagMessage {
-    BagMessage {
-        topic: Arc::from(topic),
-        wire_type: Arc::new(ros::bus::WireType::any()),
-        time: seconds * 1_000_000_000,
-        bytes: Bytes::copy_from_slice(bytes),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
+
+    fn test_message(topic: &str, seconds: u64, bytes: &[u8]) -> BagMessage {
+        let wire_type = Arc::new(ros::bus::WireType::any());
+        BagMessage { topic: Arc::from(topic), wire_type, time: seconds * SECOND, bytes: Bytes::copy_from_slice(bytes) }
+    }
 
     fn stamped_bytes(number: u32, rest: &[f64]) -> Vec<u8> {
         let mut bytes = Vec::new();
@@ -232,14 +185,8 @@ mod tests {
 
     #[test]
     fn requests_have_what_was_recorded_before_them() {
-        let recording = Recording::from_messages(vec![
-            test_message("/odom", 10, b"a"),
-            test_message("/scan", 11, b"b"),
-            test_message("/odom", 12, b"c"),
-            test_message("/odom", 13, b"d"),
-            test_message("/scan", 14, b"e"),
-            test_message("/odom", 15, b"f"),
-        ]);
+        let all = [("/odom", 10), ("/scan", 11), ("/odom", 12), ("/odom", 13), ("/scan", 14), ("/odom", 15)];
+        let recording = Recording { messages: all.map(|(topic, at)| test_message(topic, at, b"")).to_vec() };
         let steps = recording.steps("/scan");
         let told: Vec<_> = steps.iter().map(|step| (step.before.len(), step.at)).collect();
         assert_eq!(told, [(1, 1.0), (2, 4.0)]);

@@ -4,17 +4,18 @@
 use std::path::Path;
 
 use anyhow::Result;
+use support::people::picture;
 
 use crate::cells::RunCache;
 use crate::examples::EvalFixtures;
+use crate::pictures::write_pictures;
 use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
-use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
+use crate::robot::{NodeUnderTest, RobotPlan};
 use crate::section::{Section, Table};
 use crate::trace::Trace;
 
 /// Images of zeros: one more than the warm-up of a robot needs.
 const PICTURES: usize = 4;
-const BYTES: usize = 640 * 480 * 3;
 
 /// Measures both; the node runs for `seconds`.
 pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Result<Section> {
@@ -33,9 +34,8 @@ pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Resul
     })?;
     let mut table = Table::new("What came of it", "what | outcome");
     for (name, measured) in [("place", place), ("robot", robot)] {
-        let next = "run it again: what was measured stays";
-        if let Some(outcome) = measured.require(&mut section, name, next) {
-            table.push([name, outcome]);
+        if let Some(outcome) = measured.require(&mut section, name) {
+            table.push([name, outcome.as_str()]);
         }
     }
     section.tables.push(table);
@@ -44,28 +44,12 @@ pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Resul
 
 /// Returns the plan of a robot whose node is `sleep`.
 pub fn plan(directory: &Path, seconds: f64) -> Result<RobotPlan> {
-    let recording = directory.join("zeros.raw");
-    std::fs::write(&recording, vec![0; PICTURES * BYTES])?;
-    Ok(RobotPlan {
-        server: String::new(),
-        node: NodeUnderTest::Native {
-            script: "exec \"$@\"".to_owned(),
-            program: "sleep".to_owned(),
-            argv: vec![seconds.to_string()],
-        },
-        recording,
-        request: "/image".to_owned(),
-        left_out: Vec::new(),
-        besides: Vec::new(),
-        answer: "/answer".to_owned(),
-        tells_pose: false,
-        timing: None,
-        map: None,
-        pace: RequestPacing::OneByOne,
-        every: 1,
-        most: 1,
-        give_up: 1.0,
-        patience: 300.0,
-        changes: Vec::new(),
-    })
+    let recording = directory.join("zeros.messages");
+    write_pictures(&recording, &vec![picture(1, (8, 8), &[0; 8 * 8 * 3]); PICTURES], 1)?;
+    let node = NodeUnderTest::Native {
+        script: "exec \"$@\"".to_owned(),
+        program: "sleep".to_owned(),
+        argv: vec![seconds.to_string()],
+    };
+    Ok(RobotPlan { give_up: 1.0, patience: 300.0, ..RobotPlan::new(node, recording, "/image", "/answer") })
 }

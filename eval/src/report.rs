@@ -14,24 +14,16 @@ use crate::page;
 use crate::section::{FigureImage, Section};
 
 /// Things that were not available: the published one, its substitute, and the reason.
-const STAND_INS: [(&str, &str, &str); 5] = [
-    (
+const STAND_INS: [[&str; 3]; 5] = [
+    [
         "RGBD-SLAM, RTAB-Map, SSD",
         "laser_slam, graph_slam and object_detector of examples/",
         "they are not packaged for Debian 12, and their data sets are not in its archive",
-    ),
-    ("a GPU in the cloud", "none: all computes on processor cores", "the packages that stand in have no code for one"),
-    (
-        "a real robot, a Raspberry Pi, an ultrabook",
-        "control groups with a part of a core, in network namespaces",
-        "one machine has to do: ratios are of this machine",
-    ),
-    (
-        "a data centre, wireless networks",
-        "the rest of the machine; delays, rates and losses of packets between namespaces",
-        "one machine has to do",
-    ),
-    ("KinectFusion's SLAMBench", "the same three phases, told by laser_slam", "it needs a depth camera's data set"),
+    ],
+    ["a GPU in the cloud", "none: all computes on processor cores", "the packages that stand in have no code for one"],
+    ["a real robot, a Raspberry Pi, an ultrabook", "parts of a core, in network namespaces", "one machine has to do"],
+    ["a data centre, wireless networks", "delay, rate and loss between network namespaces", "one machine has to do"],
+    ["KinectFusion's SLAMBench", "the same three phases, told by laser_slam", "it needs a depth camera's data set"],
 ];
 
 #[derive(Serialize)]
@@ -39,9 +31,7 @@ struct ReportFile<'a> {
     made: String,
     machine: MachineDescription,
     sections: &'a [Section],
-    /// Times of the oldest and the newest run.
     measured: Option<(String, String)>,
-    /// Raw results, by name of the run.
     runs: BTreeMap<String, Value>,
 }
 
@@ -70,9 +60,8 @@ pub fn write(target: &Path, sections: &[Section], cells: &RunCache) -> Result<bo
         Some((oldest, _)) => format!("{made}, of what was measured on {oldest}"),
         None => made.clone(),
     };
-    let stand_ins = STAND_INS.map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
     let html = target.join("report.html");
-    std::fs::write(&html, page::render(sections, &told, &from_to, &stand_ins))?;
+    std::fs::write(&html, page::render(sections, &told, &from_to, &STAND_INS))?;
     let whole = ReportFile { made, machine, sections, measured, runs: cells.used_figures() };
     std::fs::write(target.join("report.json"), serde_json::to_vec_pretty(&whole)?)?;
     print_summary(sections);
@@ -80,7 +69,6 @@ pub fn write(target: &Path, sections: &[Section], cells: &RunCache) -> Result<bo
     Ok(sections.iter().all(|section| section.missing.is_empty()))
 }
 
-/// Prints the findings, and what is missing.
 fn print_summary(sections: &[Section]) {
     for section in sections {
         println!("{}. {}", section.number, section.title);

@@ -6,9 +6,8 @@ mod asking;
 mod boxes;
 mod carried;
 mod ends;
-mod numbers;
 mod plan;
-mod rate;
+mod stub_log;
 
 use std::path::Path;
 
@@ -20,10 +19,10 @@ use support::site::{NodeProcess, Site};
 use crate::application;
 use crate::recording::{RecordedStep, Recording};
 use crate::trace::Trace;
+use plan::WARM_UP;
 
 pub use answers::digest_message;
 pub use asking::has_ended;
-pub use numbers::{FIRST, WARM_UP};
 pub use plan::{NodeUnderTest, RequestPacing, RobotPlan};
 
 /// Runs the robot with the plan in the file `order` in this process, and writes its trace to `answer`.
@@ -50,8 +49,8 @@ fn run(plan: &RobotPlan) -> Result<Trace> {
     let asked = asking::ask(&site, &mut ends, plan, &steps, &mut node);
     let mut trace = asked.with_context(|| format!("the node said: {}", node.output()))?;
     if let NodeUnderTest::Stub { .. } = plan.node {
-        trace.handovers = rate::count_handovers(&node.output());
-        rate::apply_stub_log(&node.output(), &mut trace.requests);
+        trace.handovers = stub_log::count_handovers(&node.output());
+        stub_log::apply_stub_log(&node.output(), &mut trace.requests);
         let warns = |line: &&str| line.contains(" WARN ");
         trace.warnings = node.output().lines().filter(warns).map(str::to_owned).collect();
     }

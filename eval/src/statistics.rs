@@ -9,10 +9,10 @@ mod paths;
 mod queues;
 
 pub use bench_report::{median, quantile};
-pub use figures::{FittedLine, least_squares, mean, median_interval, root_mean_square_error, standard_deviation};
+pub use figures::{Spread, mean, root_mean_square_error, standard_deviation};
 pub use models::RrtModel;
 pub use paths::{TrajectoryError, trajectory_error};
-pub use queues::{NodeModel, QueueObservation, QueuePrediction, machine_repair, response_time, robots_per_node};
+pub use queues::{NodeModel, QueueObservation};
 
 #[cfg(test)]
 #[track_caller]

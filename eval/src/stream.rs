@@ -1,5 +1,5 @@
-//! Messages of one topic in a file, for robots that send data without a recording: a line of JSON with the topic, its
-//! type and the lengths of the messages, then the messages.
+//! Recordings that are made here: a line of JSON with the types of the topics and the lengths of the messages, then the
+//! messages, ten moments per second with one message of each topic.
 
 use std::io::Write;
 use std::path::Path;
@@ -11,70 +11,56 @@ use ros::bag::BagMessage;
 use ros::bus::WireType;
 use serde::{Deserialize, Serialize};
 
-/// Interval between two messages, in nanoseconds.
+/// Extension of the files.
+pub const EXTENSION: &str = "messages";
+/// Interval between two moments, in nanoseconds.
 const PERIOD: u64 = 100_000_000;
 
-/// Content of the first line.
+/// A topic and its type: name, MD5 in hexadecimal, and the full text of the definition.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct StreamHeader {
-    /// Topic.
-    pub topic: String,
-    /// Type, as `package/Type`.
-    pub of: String,
-    /// MD5 of the type's definition, in hexadecimal.
-    pub digest: String,
-    /// Full text of the type's definition.
-    pub definition: String,
-    /// Number of times that all messages are sent.
-    pub rounds: usize,
-    /// Length of each message in bytes.
-    #[serde(default)]
+pub struct TopicType {
+    topic: String,
+    name: String,
+    digest: String,
+    definition: String,
+}
+
+impl TopicType {
+    pub fn new(topic: &str, of: &WireType) -> Self {
+        let (name, definition) = (of.name.clone(), of.definition.clone());
+        Self { topic: topic.to_owned(), name, digest: of.digest.to_string(), definition }
+    }
+}
+
+/// Content of the first line.
+#[derive(Debug, Serialize, Deserialize)]
+struct StreamHeader {
+    topics: Vec<TopicType>,
+    rounds: usize,
+    /// Length of each message in bytes, moment by moment.
     lengths: Vec<usize>,
 }
 
-impl StreamHeader {
-    /// Header for a topic of images.
-    pub fn for_pictures(rounds: usize) -> Self {
-        Self::new("/image", &support::people::image_type(), rounds)
-    }
-
-    /// Header for a topic of maps.
-    pub fn for_maps(rounds: usize) -> Self {
-        let of = WireType::new("nav_msgs/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e", MAP);
-        Self::new("/map", &of, rounds)
-    }
-
-    fn new(topic: &str, of: &WireType, rounds: usize) -> Self {
-        Self {
-            topic: topic.to_owned(),
-            of: of.name.clone(),
-            digest: of.digest.to_string(),
-            definition: of.definition.clone(),
-            rounds,
-            lengths: Vec::new(),
-        }
-    }
-}
-
-/// Writes a file, whose name ends with `.messages`.
-pub fn write(path: &Path, head: &StreamHeader, messages: &[Bytes]) -> Result<()> {
-    let head = StreamHeader { lengths: messages.iter().map(Bytes::len).collect(), ..head.clone() };
-    let mut file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
+/// Writes moments, each with one message of each topic.
+pub fn write(path: &Path, topics: &[TopicType], moments: &[Vec<Bytes>], rounds: usize) -> Result<()> {
+    let messages = || moments.iter().flatten();
+    let head = StreamHeader { topics: topics.to_vec(), rounds, lengths: messages().map(Bytes::len).collect() };
+    let file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
+    let mut file = std::io::BufWriter::new(file);
     serde_json::to_writer(&mut file, &head)?;
     file.write_all(b"\n")?;
-    for message in messages {
-        file.write_all(message)?;
-    }
-    Ok(())
+    messages().try_for_each(|message| file.write_all(message))?;
+    Ok(file.flush()?)
 }
 
-/// Reads a file as ten messages per second.
 pub fn read(file: &Bytes) -> Result<Vec<BagMessage>> {
-    let line = file.iter().position(|byte| *byte == b'\n');
-    let line = line.context("the file has no first line")?;
+    let line = file.iter().position(|byte| *byte == b'\n').context("the file has no first line")?;
     let head: StreamHeader = serde_json::from_slice(&file[..line])?;
-    let (topic, wire_type) =
-        (Arc::<str>::from(head.topic), Arc::new(WireType::new(head.of, head.digest.as_str(), head.definition)));
+    let topic = |of: TopicType| {
+        let wire_type = WireType::new(of.name, of.digest.as_str(), of.definition);
+        (Arc::<str>::from(of.topic), Arc::new(wire_type))
+    };
+    let topics: Vec<(Arc<str>, Arc<WireType>)> = head.topics.into_iter().map(topic).collect();
     let mut from = line + 1;
     let mut messages = Vec::new();
     for length in head.lengths {
@@ -82,29 +68,13 @@ pub fn read(file: &Bytes) -> Result<Vec<BagMessage>> {
         messages.push(file.slice(from..from + length));
         from += length;
     }
-    let sent = messages.iter().cycle().take(messages.len() * head.rounds);
-    let recorded = (0..).zip(sent).map(|(number, bytes)| BagMessage {
-        topic: topic.clone(),
-        wire_type: wire_type.clone(),
-        time: number * PERIOD,
-        bytes: bytes.clone(),
+    let sent = messages.iter().cycle().take(messages.len() * head.rounds).enumerate();
+    let recorded = sent.map(|(number, bytes)| {
+        let (topic, wire_type) = topics[number % topics.len()].clone();
+        BagMessage { topic, wire_type, time: (number / topics.len()) as u64 * PERIOD, bytes: bytes.clone() }
     });
     Ok(recorded.collect())
 }
-
-/// Definition of `nav_msgs/OccupancyGrid`.
-const MAP: &str = "std_msgs/Header header\nMapMetaData info\nint8[] data\n\
-    ================================================================================\n\
-    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n\
-    ================================================================================\n\
-    MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose \
-    origin\n\
-    ================================================================================\n\
-    MSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n\
-    ================================================================================\n\
-    MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n\
-    ================================================================================\n\
-    MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n";
 
 #[cfg(test)]
 mod tests {
@@ -114,14 +84,15 @@ mod tests {
     fn messages_come_back_round_after_round() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("a.messages");
-        let messages = [Bytes::from_static(b"one\n"), Bytes::from_static(b"")];
-        write(&path, &StreamHeader::for_maps(2), &messages).expect("it is written");
+        let topics = ["/a", "/b"].map(|topic| TopicType::new(topic, &WireType::new("a/B", "0", "int32 x")));
+        let moments = [vec![Bytes::from_static(b"one\n"), Bytes::new()], vec![Bytes::from_static(b"2"), Bytes::new()]];
+        write(&path, &topics, &moments, 2).expect("it is written");
         let file = Bytes::from(std::fs::read(&path).expect("a file"));
         let back = read(&file).expect("messages");
-        let bytes: Vec<&[u8]> = back.iter().map(|one| &one.bytes[..]).collect();
-        assert_eq!(bytes, [&b"one\n"[..], b"", b"one\n", b""]);
-        assert_eq!(back[3].time, 3 * PERIOD);
-        assert_eq!(back[0].wire_type.name, "nav_msgs/OccupancyGrid");
+        let told: Vec<(&str, u64, &[u8])> =
+            back.iter().map(|one| (&*one.topic, one.time / PERIOD, &one.bytes[..])).collect();
+        assert_eq!(told[..3], [("/a", 0, &b"one\n"[..]), ("/b", 0, &b""[..]), ("/a", 1, &b"2"[..])]);
+        assert_eq!((told.len(), told[6], &*back[0].wire_type.name), (8, ("/a", 3, &b"2"[..]), "a/B"));
         assert!(read(&file.slice(..file.len() - 1)).is_err());
         assert!(read(&Bytes::from_static(b"no line")).is_err());
     }

@@ -53,12 +53,8 @@ fn find_daemon(home: &Path) -> Option<i32> {
 fn stop_daemon(pid: i32) -> Result<()> {
     kill(Pid::from_raw(pid), Signal::SIGTERM)?;
     let begun = Instant::now();
-    let is_there = || {
-        // The process is reaped by another parent.
-        let state = procfs::status(pid).and_then(|status| status.get("State").cloned());
-        state.is_some_and(|state| !state.starts_with(['Z', 'X']))
-    };
-    while is_there() {
+    // The process is reaped by another parent.
+    while procfs::is_running(pid) {
         ensure!(begun.elapsed() < END, "its daemon {pid} does not end");
         std::thread::sleep(Duration::from_millis(50));
     }

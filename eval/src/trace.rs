@@ -2,6 +2,15 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::statistics::mean;
+
+/// Names of [`ResponseParts`], in their order.
+pub const PART_NAMES: [&str; 4] = ["acquisition", "computation", "rendering", "transport and waiting"];
+
+/// Means over all requests of one run, in seconds: the durations that the package reports, and the rest of the response
+/// time.
+pub type ResponseParts = [f64; 4];
+
 /// One request and its answer.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RequestSample {
@@ -11,46 +20,35 @@ pub struct RequestSample {
     pub stamp: f64,
     /// Response time of the first answer in seconds; `None` without an answer.
     pub response: Option<f64>,
-    /// Durations that the node itself reports.
     pub phases: Option<ComputationPhases>,
     /// Pose of the robot in the answer: x and y in metres, heading in radians.
     pub pose: Option<[f64; 3]>,
     /// Hash of the answer without its header's sequence number; equal for equal answers.
     pub digest: Option<u64>,
     /// Hash of an answer that is a list of boxes, independent of their order.
-    #[serde(default)]
     pub boxes: Option<u64>,
     /// Bytes of packets that the robot had sent and received since its sandbox was created, when the answer arrived.
-    #[serde(default)]
     pub carried: Option<[u64; 2]>,
     /// Number of answers, for requests at a rate.
-    #[serde(default)]
     pub answers: usize,
     /// True if the first answer came from the local original, according to the stub.
-    #[serde(default)]
     pub local: bool,
     /// The stub's satisfaction with the cloud, Q, after this request had been counted.
-    #[serde(default)]
     pub satisfaction: Option<f64>,
 }
 
 /// Parts of one computation as in SLAMBench (Nardi et al., ICRA 2015), in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ComputationPhases {
-    /// Reading the input.
     pub acquisition: f64,
-    /// The algorithm.
     pub computation: f64,
-    /// Preparing the output for display.
     pub rendering: f64,
 }
 
 /// A published map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MapGrid {
-    /// Width in cells.
     pub width: usize,
-    /// Height in cells.
     pub height: usize,
     /// Side length of a cell in metres.
     pub resolution: f64,
@@ -68,15 +66,11 @@ pub struct Trace {
     /// Seconds from the first request to the last answer.
     pub lasted: f64,
     /// For requests at a rate: whether answers were late even before the first counted request.
-    #[serde(default)]
     pub late_before: bool,
-    /// The last map.
     pub map: Option<MapGrid>,
     /// How often the stub asked the local original as well, no longer asked it, started its process, and stopped it.
-    #[serde(default)]
     pub handovers: [usize; 4],
     /// Warnings in the node's log.
-    #[serde(default)]
     pub warnings: Vec<String>,
     /// How the node ended prematurely; `None` if it ran to the end.
     pub node_ended: Option<String>,
@@ -88,9 +82,23 @@ impl Trace {
         self.requests.iter().filter_map(|one| one.response).collect()
     }
 
-    /// Number of answered requests.
     pub fn answered_count(&self) -> usize {
         self.responses().len()
+    }
+
+    /// Returns the mean parts of the response time, over the requests whose parts are known; `None` if the package did
+    /// not report durations.
+    pub fn mean_parts(&self) -> Option<ResponseParts> {
+        let both = self.requests.iter().filter_map(|one| Some((one.response?, one.phases?)));
+        let parts = both.map(|(response, ComputationPhases { acquisition, computation, rendering })| {
+            [acquisition, computation, rendering, response - acquisition - computation - rendering]
+        });
+        let all: Vec<ResponseParts> = parts.collect();
+        let mut means = ResponseParts::default();
+        for (index, part) in means.iter_mut().enumerate() {
+            *part = mean(&all.iter().map(|one| one[index]).collect::<Vec<_>>())?;
+        }
+        Some(means)
     }
 
     /// Returns the bytes of packets per request, to the server and back, without the first `from` requests: from one
@@ -109,5 +117,24 @@ impl Trace {
     pub fn trajectory(&self) -> Vec<(f64, f64, f64)> {
         let pose = |one: &RequestSample| one.pose.map(|[x, y, _]| (one.stamp, x, y));
         self.requests.iter().filter_map(pose).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_of_a_response_is_transport() {
+        let request = |response, computation| RequestSample {
+            response: Some(response),
+            phases: Some(ComputationPhases { acquisition: 0.01, computation, rendering: 0.02 }),
+            ..RequestSample::default()
+        };
+        let mut trace = Trace::default();
+        assert_eq!(trace.mean_parts(), None);
+        trace.requests = vec![request(0.5, 0.4), request(0.7, 0.6), RequestSample::default()];
+        let found = trace.mean_parts().expect("two are known");
+        assert!(found.into_iter().zip([0.01, 0.5, 0.02, 0.07]).all(|(one, other)| (one - other).abs() < 1e-9));
     }
 }

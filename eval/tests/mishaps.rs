@@ -7,8 +7,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Mutex;
 
-use eval::place::{NetworkProfile, RobotHardware, RobotSandbox};
-use eval::rehearsal;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
@@ -165,24 +163,21 @@ fn what_a_killed_evaluation_leaves_the_next_takes_away() {
 #[test]
 fn a_robot_or_a_node_that_is_killed_is_named_and_others_go_on() {
     let _one = serialize_tests();
-    let place = RobotSandbox::new("127.0.0.1:9", RobotHardware::PI, NetworkProfile::Lan);
-    let mut place = place.expect("a place");
-    place.program = env!("CARGO_BIN_EXE_eval").into();
-    let directory = tempfile::tempdir().expect("a directory");
-    let plan = rehearsal::plan(directory.path(), LONG).expect("a plan");
-    let kills = |who: fn(u32) -> Option<i32>| {
-        std::thread::scope(|scope| {
-            let run = scope.spawn(|| place.run(&plan, directory.path()));
-            let pid = wait_until_found(|| who(std::process::id()));
-            kill(Pid::from_raw(pid), Signal::SIGKILL).expect("it is there");
-            run.join().expect("it does not panic")
-        })
+    let (_place, target, temporary) = directories();
+    let kill_and_report = |who: fn(u32) -> Option<i32>| {
+        let mut evaluation = RehearsedEvaluation::start(&target, &temporary, LONG);
+        let pid = evaluation.child.id();
+        evaluation.wait_for_output("rehearsal robot\n");
+        let victim = wait_until_found(|| who(pid));
+        kill(Pid::from_raw(victim), Signal::SIGKILL).expect("it is there");
+        let (status, _) = evaluation.wait();
+        (status.code(), report(&target))
     };
-    let killed = kills(find_robot).expect_err("the robot was killed");
-    assert!(killed.to_string().contains("signal 9"), "{killed:#}");
-    let (trace, _) = kills(find_node).expect("the robot goes on");
-    let ended = trace.node_ended.expect("the node was killed");
-    assert!(ended.contains("the node has ended"), "{ended}");
+    let (status, report) = kill_and_report(find_robot);
+    assert!(status == Some(1) && report.contains("signal 9"), "{report}");
+    // The robot goes on.
+    let (status, report) = kill_and_report(find_node);
+    assert!(status == Some(0) && report.contains("the node has ended"), "{report}");
 }
 
 #[test]
@@ -219,28 +214,18 @@ fn recordings_that_are_not_there_are_named() {
     }
 }
 
-/// Returns the child process that runs a robot, once there is one.
+/// Returns the process that runs a robot, once there is one.
 fn find_robot(pid: u32) -> Option<i32> {
-    children(pid as i32).into_iter().find(|child| {
-        let line = support::procfs::command_line(*child).unwrap_or_default();
-        line.contains(" robot ") && !line.starts_with("nsenter")
-    })
+    find_descendant(pid, |line| line.contains(" robot ") && !line.starts_with("nsenter"))
 }
 
 fn find_node(pid: u32) -> Option<i32> {
-    children(find_robot(pid)?).into_iter().find(|child| {
-        let line = support::procfs::command_line(*child).unwrap_or_default();
-        line.starts_with("sleep ")
-    })
+    find_descendant(pid, |line| line.starts_with("sleep "))
 }
 
-fn children(pid: i32) -> Vec<i32> {
-    let of = |child: &i32| {
-        let status = support::procfs::status(*child)?;
-        Some(status.get("PPid")?.parse() == Ok(pid))
-    };
-    let all = support::procfs::pids().into_iter();
-    all.filter(|child| of(child) == Some(true)).collect()
+fn find_descendant(pid: u32, is: impl Fn(&str) -> bool) -> Option<i32> {
+    let all = support::procfs::with_descendants(&[pid as i32]).into_iter().skip(1);
+    all.into_iter().find(|child| is(&support::procfs::command_line(*child).unwrap_or_default()))
 }
 
 fn find_daemon(temporary: &Path) -> Option<i32> {

@@ -23,6 +23,7 @@ use ::ros::schema::{InterfaceFile, MessageType, Registry};
 use ::rosbridge::{Fragment, FragmentLimits, Fragments, Id, Op, decode_png, unknown_fields};
 use ::rtps::wire::{self, ParticipantMessage};
 use ::rtps::{EndpointData, ParticipantData};
+use ::translation::TranslationRules;
 use ::ws::{WebSocket, WsMessage};
 use budget::JsonWeight;
 use bytes::Bytes;
@@ -32,10 +33,10 @@ use serde::de::DeserializeOwned;
 use crate::codec::LIMIT;
 use crate::translation::PAIRS;
 pub use repeats::Repeat;
-use repeats::{DEFINITIONS, HELLO, ORDERS, ROSBRIDGE, VALUES, VIEWER, XML_RPC};
+use repeats::{DEFINITIONS, HELLO, INTERFACES, MANIFESTS, ORDERS, ROSBRIDGE, SAVED, VALUES, VIEWER, XML_RPC};
 
 /// Maximum number of bytes that a conversion may write here.
-const WRITTEN: usize = 1 << 14;
+const MAX_OUTPUT: usize = 1 << 14;
 /// Memory that no decoder need account for: a name in an error, a buffer of minimum size.
 const LITTLE: usize = 4 << 10;
 
@@ -81,15 +82,15 @@ pub const DECODERS: &[Decoder] = &[
     decoder("rosbridge_cbor", op_cbor, 4, LITTLE),
     decoder("rosbridge_fragments", fragments, 8, LITTLE),
     decoder("rosbridge_png", png, 8, 4 * LIMIT),
-    decoder("ros_json", json, 4, 4 * WRITTEN).with_repeats(VALUES),
-    decoder("ros_cbor", cbor, 4, 4 * WRITTEN),
-    decoder("ros_bytes", bytes, 96, 4 * WRITTEN),
+    decoder("ros_json", json, 4, 4 * MAX_OUTPUT).with_repeats(VALUES),
+    decoder("ros_cbor", cbor, 4, 4 * MAX_OUTPUT),
+    decoder("ros_bytes", bytes, 96, 4 * MAX_OUTPUT),
     decoder("ros_definition", definition, 64, 64 << 10).with_repeats(DEFINITIONS),
     decoder("ros_tcpros", tcpros, 8, LITTLE),
     decoder("ros_xmlrpc", xml_rpc, 16, LITTLE).with_repeats(XML_RPC).with_weigh(xmlrpc::weight),
-    decoder("ros2_json", json_2, 4, 4 * WRITTEN).with_repeats(VALUES),
-    decoder("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
-    decoder("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
+    decoder("ros2_json", json_2, 4, 4 * MAX_OUTPUT).with_repeats(VALUES),
+    decoder("ros2_cbor", cbor_2, 4, 4 * MAX_OUTPUT),
+    decoder("ros2_bytes", bytes_2, 96, 4 * MAX_OUTPUT),
     decoder("ros2_definition", definition_2, 64, 64 << 10).with_repeats(DEFINITIONS),
     decoder("translation_bytes", carry, 48, 256 << 10),
     decoder("rtps_datagram", datagram, 4, LITTLE),
@@ -103,12 +104,23 @@ pub const DECODERS: &[Decoder] = &[
     decoder("codec_cloud", decode_packed, 8, CODEC),
     decoder("codec_jpeg", decode_packed, 8, CODEC),
     decoder("codec_frame", decode_packed, 8, CODEC),
+    decoder("ros_bag", bag, 32, LITTLE),
+    decoder("image_archive", crate::image::archive, 8, ARCHIVE),
+    decoder("image_saved", crate::image::saved_image, 64, 1 << 20).with_repeats(SAVED),
+    decoder("package_manifest", crate::package::manifest, TREE, 64 << 10).with_repeats(MANIFESTS),
+    decoder("package_interface", crate::package::interface, TOML, 64 << 10).with_repeats(INTERFACES),
+    decoder("translation_rules", rules, TOML, 4 << 20),
+    decoder("sign_signature", crate::sign::signature, 16, LITTLE),
     decoder("authority_request", request, 8, LITTLE),
     decoder("authority_certificate", certificate, 8, LITTLE),
 ];
 
 /// Factor for trees of values: a map with one member is eight bytes of text, and a node of eleven entries in memory.
 const TREE: usize = 128;
+/// Factor for configuration files: tables keep the place of each key and value for messages.
+const TOML: usize = 512;
+/// Constant for archives: extended headers of one entry take 1 MiB, which a compressed archive has in a few bytes.
+const ARCHIVE: usize = 8 << 20;
 /// Constant for codecs: besides the message, a decoder keeps an image and tables of its own.
 const CODEC: usize = 8 * LIMIT + (1 << 20);
 
@@ -194,11 +206,11 @@ fn message_of(version: RosVersion) -> Arc<MessageType> {
     registry.message("a/All").expect("it was inserted")
 }
 
-static ONE: LazyLock<Arc<MessageType>> = LazyLock::new(|| message_of(RosVersion::One));
+static ROS1_TYPE: LazyLock<Arc<MessageType>> = LazyLock::new(|| message_of(RosVersion::One));
 static TWO: LazyLock<Arc<MessageType>> = LazyLock::new(|| message_of(RosVersion::Two));
 
 fn fill() -> FillOptions {
-    FillOptions { max_bytes: WRITTEN, ..FillOptions::default() }
+    FillOptions { max_bytes: MAX_OUTPUT, ..FillOptions::default() }
 }
 
 fn json_of(of: &MessageType, input: &[u8]) {
@@ -206,7 +218,7 @@ fn json_of(of: &MessageType, input: &[u8]) {
 }
 
 fn json(input: &[u8]) {
-    json_of(&ONE, input);
+    json_of(&ROS1_TYPE, input);
 }
 
 fn json_2(input: &[u8]) {
@@ -218,7 +230,7 @@ fn cbor_of(of: &MessageType, input: &[u8]) {
 }
 
 fn cbor(input: &[u8]) {
-    cbor_of(&ONE, input);
+    cbor_of(&ROS1_TYPE, input);
 }
 
 fn cbor_2(input: &[u8]) {
@@ -227,14 +239,14 @@ fn cbor_2(input: &[u8]) {
 
 fn bytes_of(of: &MessageType, input: &[u8]) {
     let _ = Value::read(of, input);
-    let json = JsonOptions { max_bytes: WRITTEN, ..JsonOptions::default() };
-    let cbor = CborOptions { max_bytes: WRITTEN, ..CborOptions::default() };
+    let json = JsonOptions { max_bytes: MAX_OUTPUT, ..JsonOptions::default() };
+    let cbor = CborOptions { max_bytes: MAX_OUTPUT, ..CborOptions::default() };
     let _ = codec::to_json(of, input, &mut Vec::new(), &json);
     let _ = codec::to_cbor(of, input, &mut Vec::new(), &cbor);
 }
 
 fn bytes(input: &[u8]) {
-    bytes_of(&ONE, input);
+    bytes_of(&ROS1_TYPE, input);
 }
 
 fn bytes_2(input: &[u8]) {
@@ -271,6 +283,14 @@ fn carry(input: &[u8]) {
         let _ = pair.to_twin.translate(input);
         let _ = pair.from_twin.translate(input);
     }
+}
+
+fn rules(input: &[u8]) {
+    let _ = TranslationRules::default().with_yaml("rules.yaml", &String::from_utf8_lossy(input));
+}
+
+fn bag(input: &[u8]) {
+    let _ = ::ros::bag::read(&Bytes::copy_from_slice(input), usize::MAX);
 }
 
 fn tcpros(input: &[u8]) {

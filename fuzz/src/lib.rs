@@ -12,11 +12,14 @@ pub mod authority;
 pub mod codec;
 pub mod damage;
 pub mod decoders;
+pub mod image;
 pub mod link;
+pub mod package;
 pub mod ros;
 pub mod ros2;
 pub mod rosbridge;
 pub mod rtps;
+pub mod sign;
 pub mod translation;
 pub mod viewer;
 pub mod ws;
@@ -63,6 +66,12 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("viewer_json", viewer::json),
     ("translation_bytes", translation::bytes),
     ("translation_rules", translation::rules),
+    ("ros_bag", ros::bag),
+    ("image_archive", image::archive),
+    ("image_saved", image::saved_image),
+    ("package_manifest", package::manifest),
+    ("package_interface", package::interface),
+    ("sign_signature", sign::signature),
 ];
 
 /// Defines the program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzing build the program does nothing.

@@ -11,7 +11,7 @@ use ::ros::codec::{
 use ::ros::ros1::tcpros::{FrameReader, Header};
 use ::ros::ros1::xmlrpc::{self, parse_call, parse_response, print_call, print_response};
 use ::ros::schema::{MessageType, Registry};
-use bytes::BytesMut;
+use bytes::{Bytes, BytesMut};
 
 /// Maximum number of bytes that a conversion may write here.
 const MAX_BYTES: usize = 1 << 20;
@@ -235,5 +235,15 @@ pub fn parameter(data: &[u8]) {
     if let Ok(sent) = xmlrpc::Value::try_from(value.clone()) {
         assert!(sent.depth() <= ParamValue::MAX_DEPTH);
         assert_eq!(ParamValue::from(sent), value);
+    }
+}
+
+/// A recording; messages point into it.
+pub fn bag(data: &[u8]) {
+    const MAX_ITEMS: usize = 100;
+    if let Ok(messages) = ::ros::bag::read(&Bytes::copy_from_slice(data), MAX_ITEMS) {
+        assert!(messages.len() <= MAX_ITEMS);
+        let bytes: usize = messages.iter().map(|message| message.bytes.len()).sum();
+        assert!(bytes <= data.len(), "{bytes} bytes of messages in {}", data.len());
     }
 }

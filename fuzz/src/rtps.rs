@@ -30,8 +30,8 @@ pub fn discovery(data: &[u8]) {
     check_round_trip(&payload, ParticipantMessage::from_payload, ParticipantMessage::to_bytes);
 }
 
-/// Above this length a value that was read can be too long for a parameter when it is written.
-const MOST: usize = 16 << 10;
+/// Length above which a value that was read can be too long for a parameter when it is written.
+const MAX_VALUE_LENGTH: usize = 16 << 10;
 
 fn check_round_trip<T: PartialEq + Debug>(
     payload: &Bytes,
@@ -39,7 +39,7 @@ fn check_round_trip<T: PartialEq + Debug>(
     write: fn(&T) -> Bytes,
 ) {
     match read(payload) {
-        Ok(told) if payload.len() <= MOST => assert_eq!(read(&write(&told)), Ok(told)),
+        Ok(told) if payload.len() <= MAX_VALUE_LENGTH => assert_eq!(read(&write(&told)), Ok(told)),
         Ok(_) => {}
         Err(error) => assert!(!error.to_string().is_empty()),
     }

@@ -16,12 +16,12 @@ use nix::fcntl::{Flock, FlockArg};
 use tokio::process::Command;
 
 use crate::cache::write_atomically;
+use crate::cache_cleanup;
 use crate::candidates::Candidates;
 use crate::debian_package::{Deb, Relations};
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::process::{self, Stream};
-use crate::unused;
 use output::{NAMING, extract_errors, parse_relations, parse_stanza, parse_uri, suggest_next_step};
 
 /// Package sources: lines of a sources.list for each base that is listed. Other bases use the host's own apt sources,
@@ -294,7 +294,7 @@ impl Apt {
         }
         let files: Vec<PathBuf> = debs.iter().map(|deb| archives.join(deb.file_name())).collect();
         for file in &files {
-            unused::mark_used(file);
+            cache_cleanup::mark_used(file);
         }
         Ok(files)
     }

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use image::Digest;
 use ros::flavour::{Flavour, Version};
+use ros::ros2::middleware;
 use serde::{Deserialize, Serialize};
 
 pub use crate::base_file_error::{BaseFileError, BaseFileProblem, WheelsError};
@@ -259,6 +260,10 @@ fn parse(text: &str) -> Result<Definition, BaseFileError> {
             let problem = BaseFileProblem::StripRule(rule.clone());
             return Err(wrong(&format!("{rule:?}"), problem));
         }
+    }
+    if definition.ros == Version::Ros2 {
+        let checked = middleware::check_environment(&definition.environment);
+        checked.map_err(|error| wrong(middleware::VARIABLE, error.into()))?;
     }
     if let Some(wheels) = &definition.wheels {
         wheels.check().map_err(|error| wrong("[wheels]", error.into()))?;

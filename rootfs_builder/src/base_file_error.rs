@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use ros::ros2::middleware::UnsupportedMiddleware;
+
 /// Reason why the text of a definition is invalid, with its line if it is known.
 #[derive(Debug, thiserror::Error)]
 #[error("{}{problem}", .line.map(|line| format!("line {line}: ")).unwrap_or_default())]
@@ -30,6 +32,9 @@ pub enum BaseFileProblem {
     /// Invalid properties of wheels.
     #[error(transparent)]
     Wheels(#[from] WheelsError),
+    /// Robots would not reach the nodes.
+    #[error("environment: {0}; set RMW_IMPLEMENTATION to rmw_fastrtps_cpp or rmw_cyclonedds_cpp")]
+    Middleware(#[from] UnsupportedMiddleware),
     /// Invalid path.
     #[error("{0:?} is not an absolute path below /")]
     Path(String),

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use image::{Mtime, TreeOptions};
+use package::system::parse_status;
 
 use crate::archive::Archive;
 use crate::base::Base;
@@ -147,24 +148,14 @@ fn normalize_tree(tree: &Path) -> Result<(), Error> {
 pub(crate) fn installed_packages(tree: &Path) -> Result<Vec<String>, Error> {
     let path = tree.join("var/lib/dpkg/status");
     let text = fs::read_to_string(&path).io_context("reading", &path)?;
-    let mut all: Vec<String> = parse_status(&text).iter().map(Deb::to_string).collect();
+    let installed = parse_status(&text).map(|package| Deb {
+        name: package.name,
+        version: package.version,
+        architecture: package.architecture,
+    });
+    let mut all: Vec<String> = installed.map(|deb| deb.to_string()).collect();
     all.sort();
     Ok(all)
-}
-
-/// Returns the installed packages of a status file of dpkg.
-pub(crate) fn parse_status(text: &str) -> Vec<Deb> {
-    text.split("\n\n").filter_map(parse_installed).collect()
-}
-
-fn parse_installed(text: &str) -> Option<Deb> {
-    let field = |name: &str| text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": "));
-    (field("Status")? == "install ok installed").then_some(())?;
-    Some(Deb {
-        name: field("Package")?.to_owned(),
-        version: field("Version")?.to_owned(),
-        architecture: field("Architecture")?.to_owned(),
-    })
 }
 
 #[cfg(test)]

@@ -21,9 +21,10 @@ use crate::install::{self, LayerAddition, LayerSet};
 use crate::key::Key;
 use crate::keys;
 use crate::launch::{self, LaunchPlan, LaunchQuery};
-use crate::pushed;
+use crate::middleware;
+use crate::missing_modules;
+use crate::pushed_packages;
 use crate::request::{BuildOutcome, BuiltLayer, BuiltUnderlay, PushRequest};
-use crate::undeclared;
 use crate::underlay::{Foundation, UnderlayContents};
 use crate::workshop::{BuildContext, StagedLayer};
 
@@ -56,7 +57,7 @@ pub(crate) struct BuildParts {
     pub(crate) package: LayerSet,
     /// Prefix of its install space; `None` for one below `/usr`.
     pub(crate) prefix: Option<PathBuf>,
-    /// What others need to know to stand on it, if it becomes an underlay.
+    /// Facts for packages that are built upon it, if it becomes an underlay.
     pub(crate) contents: Option<UnderlayContents>,
 }
 
@@ -197,6 +198,7 @@ impl Build<'_> {
         let answer = launch::query_plan(&self.shop, self.base.ros, trees.clone(), self.base.environment.clone(), &ask)
             .await
             .map_err(|error| advice::add_advice(error, AdviceIndex::for_base(&self.archive, &self.base)))?;
+        middleware::check_plan(&answer, self.base.ros)?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }
@@ -207,7 +209,7 @@ impl Build<'_> {
         for name in flavour.environment("").keys() {
             environment.remove(name);
         }
-        let package = pushed::main_package(&made.packages, &answer.nodes);
+        let package = pushed_packages::main_package(&made.packages, &answer.nodes);
         let version = made.versions.get(&package).cloned().unwrap_or_default();
         let of = (package.clone(), environment.clone(), answer.nodes.clone());
         let known = (self.archive.clone(), self.base.clone());
@@ -218,7 +220,7 @@ impl Build<'_> {
             let inventory = Inventory::scan(&trees, of)?;
             let (archive, base) = known;
             let undeclared = if base.has_distributions_ros() {
-                undeclared::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
+                missing_modules::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
             } else {
                 // Programs of ROS 2 are created by setuptools and import their packages by name, and the archive's
                 // index does not tell what is in install spaces.

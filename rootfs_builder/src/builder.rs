@@ -27,10 +27,10 @@ use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{advice, blocking, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
+use crate::{advice, blocking, cache_cleanup, packaged, prebuilt, seal, source, sources, stock, wheels};
 
 /// Maximum number of logs of failed builds.
-const LOGS_KEPT: usize = 50;
+const MAX_LOGS: usize = 50;
 
 /// Configuration of a builder.
 #[derive(Clone)]
@@ -189,7 +189,7 @@ impl Builder {
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
         let swept = cache.clone();
-        blocking::spawn(move || unused::sweep(&swept)).await?;
+        blocking::spawn(move || cache_cleanup::sweep(&swept)).await?;
         let work = async {
             let made = match content {
                 PushContent::Tree(PushedDirectory::Source(workspace)) => source::build(&build, workspace).await?,
@@ -212,7 +212,7 @@ impl Builder {
         }
         // A failed build also fills the cache.
         let most = self.config.cache_bytes;
-        blocking::spawn(move || unused::shrink(&cache, most)).await?;
+        blocking::spawn(move || cache_cleanup::shrink(&cache, most)).await?;
         let outcome = outcome?;
         settled?;
         Ok(outcome)
@@ -336,7 +336,7 @@ fn sweep_logs(directory: &Path) {
         .filter_map(|entry| Some((entry.metadata().ok()?.modified().ok()?, entry.path())))
         .collect();
     logs.sort();
-    for (_, path) in logs.iter().rev().skip(LOGS_KEPT) {
+    for (_, path) in logs.iter().rev().skip(MAX_LOGS) {
         let _ = fs::remove_file(path);
     }
 }
@@ -472,7 +472,7 @@ pub(crate) mod tests {
     #[test]
     fn only_the_newest_logs_are_kept() {
         let directory = tempfile::tempdir().expect("a directory");
-        for number in 0..LOGS_KEPT + 3 {
+        for number in 0..MAX_LOGS + 3 {
             let path = directory.path().join(format!("{number}.log"));
             let file = fs::File::create(path).expect("made");
             let time = std::time::UNIX_EPOCH + std::time::Duration::from_secs(number as u64);
@@ -481,7 +481,7 @@ pub(crate) mod tests {
         fs::write(directory.path().join("other.txt"), "").expect("written");
         sweep_logs(directory.path());
         let left = fs::read_dir(directory.path()).expect("listed").count();
-        assert_eq!(left, LOGS_KEPT + 1);
+        assert_eq!(left, MAX_LOGS + 1);
         assert!(!directory.path().join("2.log").exists() && directory.path().join("3.log").exists());
     }
 }

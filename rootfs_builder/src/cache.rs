@@ -10,9 +10,9 @@ use image::{LayerInfo, Store};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use crate::cache_cleanup;
 use crate::error::{Error, IoContext};
 use crate::packings::Packings;
-use crate::unused;
 
 /// Returns the key of the note with the layers to keep for a base.
 pub(crate) fn keep_note_key(base: &str) -> String {
@@ -88,8 +88,8 @@ impl LayerCache {
         let Some(layer) = entry.layer else {
             return Ok(Some(entry));
         };
-        unused::mark_used(&about);
-        unused::mark_used(&archive);
+        cache_cleanup::mark_used(&about);
+        cache_cleanup::mark_used(&archive);
         if self.store.layer(&layer.diff_id)?.is_some() {
             return Ok(Some(entry));
         }
@@ -110,7 +110,7 @@ impl LayerCache {
     pub(crate) fn read_note<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         let path = self.notes.join(key);
         let value = serde_json::from_slice(&fs::read(&path).ok()?).ok()?;
-        unused::mark_used(&path);
+        cache_cleanup::mark_used(&path);
         Some(value)
     }
 

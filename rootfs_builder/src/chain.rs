@@ -17,9 +17,9 @@ use image::Digest;
 use serde::{Deserialize, Serialize};
 
 use crate::cache::write_atomically;
+use crate::cache_cleanup;
 use crate::error::{Error, IoContext};
 use crate::key::Key;
-use crate::unused;
 
 /// Maximum number of links in a chain, in addition to the base and package layers of an image. Registries and the
 /// kernel allow more, but each link slows down file lookups a little.
@@ -78,7 +78,7 @@ impl Chains {
     /// Marks links as used.
     pub(crate) fn mark_used(&self, keys: &[String]) {
         for key in keys {
-            unused::mark_used(&self.directory.join(format!("{key}.json")));
+            cache_cleanup::mark_used(&self.directory.join(format!("{key}.json")));
         }
     }
 

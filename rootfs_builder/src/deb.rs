@@ -7,8 +7,8 @@ use std::process::{Command, Stdio};
 
 use serde::{Deserialize, Serialize};
 
+use crate::cache_cleanup;
 use crate::error::{Error, IoContext};
-use crate::unused;
 
 /// A file or link of a Debian package.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,19 +33,19 @@ pub(crate) enum MemberContent {
 }
 
 /// Directory of the cache; to be changed when [`is_needed_at_runtime`] changes.
-const KEPT: &str = "members-1";
+const CACHE_DIRECTORY: &str = "members-1";
 
 /// Returns the members that are needed at run time ([`is_needed_at_runtime`]), sorted by path. They are cached below
 /// `cache` under the name of the package's file, since most ROS packages are inspected repeatedly and unpacking takes
 /// long. Blocking.
 pub(crate) fn runtime_members(deb: &Path, cache: &Path) -> Result<Vec<DebMember>, Error> {
-    let directory = cache.join(KEPT);
+    let directory = cache.join(CACHE_DIRECTORY);
     let name = Path::new(deb.file_name().unwrap_or_default()).with_extension("tar");
     let path = directory.join(name);
     if let Ok(file) = File::open(&path)
         && let Ok(found) = read_archive(BufReader::new(file), &path, |_| true)
     {
-        unused::mark_used(&path);
+        cache_cleanup::mark_used(&path);
         return Ok(found);
     }
     let mut found = read_members(deb, is_needed_at_runtime)?;
@@ -224,7 +224,7 @@ mod tests {
         let torn = directory.path().join("torn_1_all.deb");
         std::fs::write(&torn, "torn").expect("written");
         runtime_members(&torn, &cache).expect_err("not a package");
-        assert!(!cache.join(KEPT).join("torn_1_all.tar").exists());
+        assert!(!cache.join(CACHE_DIRECTORY).join("torn_1_all.tar").exists());
     }
 
     #[test]

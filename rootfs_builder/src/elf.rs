@@ -23,8 +23,14 @@ const DT_NULL: u64 = 0;
 const DT_NEEDED: u64 = 1;
 const DT_STRTAB: u64 = 5;
 const DT_STRSZ: u64 = 10;
-/// Maximum size of a dynamic section or string table; a damaged header may state more.
-const LARGEST: u64 = 64 << 20;
+/// Maximum size of a header table or dynamic section; a damaged header may state more.
+const LARGEST: u64 = 1 << 20;
+/// Maximum number of names that are read of a file, and of all files. Entries may all name parts of one long text, so
+/// that a small file has any number of long names.
+const MOST_OF_FILE: usize = 1024;
+const MOST_OF_ALL: usize = 20_000;
+/// Maximum length of a file's name.
+const LONGEST_NAME: u64 = 255;
 
 struct Segment {
     kind: u32,
@@ -79,14 +85,20 @@ fn parse_dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
         let inside = address.checked_sub(segment.address)?;
         (inside < segment.size).then(|| segment.offset.checked_add(inside))
     })??;
-    let table = read_range(file, place, length)?;
-    let needed = names.into_iter().filter_map(|at| {
-        let rest = table.get(usize::try_from(at).ok()?..)?;
-        let end = rest.iter().position(|byte| *byte == 0)?;
-        let name = String::from_utf8(rest[..end].to_vec()).ok()?;
-        (!name.is_empty()).then_some(name)
-    });
-    Some(Dynamic { needed: needed.collect() })
+    let mut needed = BTreeSet::new();
+    for at in names.into_iter().filter(|at| *at < length).take(MOST_OF_FILE) {
+        needed.extend(read_name(file, place.checked_add(at)?, length - at));
+    }
+    Some(Dynamic { needed })
+}
+
+/// Reads the name at `offset`, which ends with a zero within `most` bytes; `None` if no file can have it.
+fn read_name(file: &mut File, offset: u64, most: u64) -> Option<String> {
+    file.seek(SeekFrom::Start(offset)).ok()?;
+    let mut bytes = Vec::new();
+    (&mut *file).take(most.min(LONGEST_NAME + 1)).read_to_end(&mut bytes).ok()?;
+    bytes.truncate(bytes.iter().position(|byte| *byte == 0)?);
+    String::from_utf8(bytes).ok().filter(|name| !name.is_empty())
 }
 
 fn parse_segment(raw: &[u8], wide: bool) -> Option<Segment> {
@@ -129,6 +141,7 @@ pub(crate) fn needed_libraries(root: &Path) -> Result<BTreeSet<String>, Error> {
             present.insert(entry.name().to_string_lossy().into_owned());
         }
         if entry.kind() == FileType::RegularFile
+            && needed.len() < MOST_OF_ALL
             && let Some(dynamic) = read_dynamic(entry.open()?, &entry.display_path())?
         {
             needed.extend(dynamic.needed);
@@ -167,9 +180,8 @@ mod tests {
         }
     }
 
-    /// Creates a 64-bit file with one loaded segment and a dynamic section whose string table is at `address`.
-    fn elf_file(segment: Segment, address: u64) -> Vec<u8> {
-        let entries = [(DT_NEEDED, 1), (DT_STRTAB, address), (DT_STRSZ, 9), (DT_NULL, 0)];
+    /// Creates a 64-bit file with one loaded segment, a dynamic section and a string table behind it.
+    fn elf_file(segment: Segment, entries: &[(u64, u64)], strings: &[u8]) -> Vec<u8> {
         let dynamic = Segment { kind: PT_DYNAMIC, offset: 64 + 2 * 56, address: 0, size: 16 * entries.len() as u64 };
         let mut bytes = b"\x7fELF\x02\x01".to_vec();
         bytes.resize(64, 0);
@@ -182,7 +194,7 @@ mod tests {
         for (tag, value) in entries {
             bytes.extend([tag, value].iter().flat_map(|word| word.to_le_bytes()));
         }
-        bytes.extend(b"\0libx.so\0");
+        bytes.extend(strings);
         bytes
     }
 
@@ -193,7 +205,8 @@ mod tests {
         let needs = |offset, address, size, table| {
             let kind = PT_LOAD;
             let segment = Segment { kind, offset, address, size };
-            std::fs::write(&path, elf_file(segment, table)).expect("written");
+            let entries = [(DT_NEEDED, 1), (DT_STRTAB, table), (DT_STRSZ, 9), (DT_NULL, 0)];
+            std::fs::write(&path, elf_file(segment, &entries, b"\0libx.so\0")).expect("written");
             let dynamic = read(&path).expect("read")?;
             dynamic.needed.into_iter().next()
         };
@@ -207,6 +220,24 @@ mod tests {
         ] {
             assert_eq!(needs(offset, address, size, table), None, "{offset} {address}");
         }
+    }
+
+    #[test]
+    fn many_names_in_one_long_text_take_little() {
+        const LENGTH: u64 = 1 << 20;
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("x");
+        let mut strings = vec![b'a'; LENGTH as usize];
+        strings.extend(b"\0");
+        // The last ones are short enough for names of files; there are more than are read.
+        let mut entries: Vec<(u64, u64)> = (0..40_000).map(|number| (DT_NEEDED, LENGTH - 1 - number)).collect();
+        let table = 64 + 2 * 56 + 16 * (entries.len() as u64 + 3);
+        entries.extend([(DT_STRTAB, table), (DT_STRSZ, LENGTH + 1), (DT_NULL, 0)]);
+        let segment = Segment { kind: PT_LOAD, offset: 0, address: 0, size: u64::MAX };
+        std::fs::write(&path, elf_file(segment, &entries, &strings)).expect("written");
+        let needed = read(&path).expect("read").expect("an ELF file").needed;
+        assert_eq!(needed.len(), 255);
+        assert!(needed.iter().all(|name| name.len() <= 255));
     }
 
     #[test]

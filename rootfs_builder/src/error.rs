@@ -99,7 +99,7 @@ pub enum Error {
         /// Missing Debian packages.
         missing: String,
     },
-    /// There is nothing to export of a base.
+    /// The base has not been set up, so there is nothing to export.
     #[error("base {base} was not set up on this server yet; the first push that uses it does that, then export again")]
     BaseNotSetUp {
         /// Name of the base.
@@ -157,7 +157,7 @@ pub enum Error {
     NoTools {
         /// Name of the base.
         base: String,
-        /// What is missing.
+        /// Name of the missing part.
         missing: String,
         /// Reason why it cannot be installed.
         words: String,
@@ -255,7 +255,7 @@ pub enum Error {
         name: String,
         /// Existing names.
         known: String,
-        /// Where it exists instead, with the option that adds it.
+        /// Place where it exists instead, with the option that adds it.
         elsewhere: String,
     },
     /// The push does not state what to run.
@@ -287,7 +287,7 @@ pub enum Error {
     UnderlayBase {
         /// Name of the underlay.
         underlay: String,
-        /// Its base.
+        /// Base of the underlay.
         base: String,
         /// Base of the push.
         wanted: String,
@@ -297,7 +297,7 @@ pub enum Error {
     UnderlayImage {
         /// Name of the underlay.
         underlay: String,
-        /// Its base.
+        /// Base of the underlay.
         base: String,
     },
     /// A package is in two underlays.
@@ -429,6 +429,9 @@ pub enum Error {
         /// Build types supported by the base.
         builds: &'static str,
     },
+    /// Robots would not reach the nodes, because of their middleware.
+    #[error(transparent)]
+    Middleware(#[from] crate::middleware::MiddlewareError),
     /// The interface of the running package could not be probed.
     #[error("{0}")]
     Probe(#[from] crate::probe::ProbeError),

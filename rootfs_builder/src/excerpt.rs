@@ -20,7 +20,7 @@ pub(crate) struct Excerpt {
 
 impl Excerpt {
     /// Maximum number of lines about missing dependencies; more usually have the same cause.
-    const MOST: usize = 25;
+    const MAX_MISSING_LINES: usize = 25;
     /// Maximum number of lines of the first errors, and number of lines after each that explain it.
     const MOST_ERRORS: usize = 12;
     const CONTEXT: usize = 3;
@@ -33,7 +33,7 @@ impl Excerpt {
         let Some(dropped) = self.last.push(line) else {
             return;
         };
-        if self.missing < Self::MOST && advice::mentions_missing(&dropped) {
+        if self.missing < Self::MAX_MISSING_LINES && advice::mentions_missing(&dropped) {
             self.missing += 1;
             self.early.push(dropped);
             return;

@@ -23,7 +23,6 @@ use package::system;
 
 use crate::archive::Archive;
 use crate::base::{self, Base, ImportedImage};
-use crate::bootstrap::parse_status;
 use crate::builder::Builder;
 use crate::cache::keep_note_key;
 use crate::error::{Error, IoContext};
@@ -88,14 +87,14 @@ impl Builder {
             let environment = system::make_environment(&trees, &system, &received.env)?;
             Ok::<_, system::SystemError>((system, environment))
         })?;
-        let debian = system.dpkg_status.as_deref().map(parse_status).unwrap_or_default();
+        let debian = system.debian.clone().unwrap_or_default();
         let image = ImportedImage {
             source: received.source,
             layers: diff_ids,
             missing_tools: definition::find_missing_tools(&system),
             installs_python: definition::installs_python(&system),
-            findings: findings::list_findings(&system, debian.len()),
-            debian: debian.into_iter().map(|deb| (deb.name, deb.version)).collect(),
+            findings: findings::list_findings(&system, &received.env, debian.len()),
+            debian,
             ros: system.packages(),
         };
         let definition = definition::make_definition(self.bases_dir(), &system, environment, image)?;

@@ -11,12 +11,12 @@ use serde::{Deserialize, Serialize};
 use crate::advice;
 use crate::archive::Archive;
 use crate::cache::write_atomically;
+use crate::cache_cleanup;
 use crate::deb::{self, MemberContent};
 use crate::error::{Error, IoContext};
-use crate::unused;
 
 /// Directory below the cache; to be changed when the cached content changes.
-const KEPT: &str = "imports-1";
+const CACHE_DIRECTORY: &str = "imports-1";
 
 /// Top-level modules that the Python files of a Debian package import when they are loaded.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,10 +50,10 @@ impl Imports {
 
 /// Inspects a Debian package. The result is cached below `cache` under the name of the package's file. Blocking.
 pub(crate) fn read_imports(deb: &Path, cache: &Path) -> Result<Imports, Error> {
-    let directory = cache.join(KEPT);
+    let directory = cache.join(CACHE_DIRECTORY);
     let path = directory.join(deb.file_name().unwrap_or_default());
     if let Some(found) = fs::read(&path).ok().and_then(|text| serde_json::from_slice(&text).ok()) {
-        unused::mark_used(&path);
+        cache_cleanup::mark_used(&path);
         return Ok(found);
     }
     let mut found = Imports::default();

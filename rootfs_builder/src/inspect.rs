@@ -1,4 +1,4 @@
-//! What can be said of a push before it is built, and before it waits for a place among the builds: whether it is a
+//! Inspection of a push before it is built, and before it waits for a place among the builds: whether it is a
 //! package, on which base, what it will run, and which dependencies nothing provides.
 
 use std::sync::Arc;
@@ -13,16 +13,16 @@ use crate::builder::Builder;
 use crate::error::Error;
 use crate::event::{BuildEvent, Progress};
 use crate::indexed::{self, IndexedPackages};
-use crate::pushed::{self, InspectedTree};
+use crate::pushed_packages::{self, InspectedTree};
 use crate::request::{PushRequest, PushSource};
 use crate::underlay::Foundation;
 use crate::workshop::PushLabel;
-use crate::{blocking, choice, keys, launch, source};
+use crate::{blocking, choice, keys, launch, middleware, source};
 
 /// Maximum number of mistakes in build files that are named.
 const MOST_PROBLEMS: usize = 20;
 /// Maximum number of packages that are named when they are not built.
-const NAMED: usize = 12;
+const MAX_NAMED_PACKAGES: usize = 12;
 
 /// A push of which nothing is known that would keep it from being built.
 #[derive(Debug)]
@@ -35,7 +35,7 @@ pub struct InspectedPush {
 /// Content of a push.
 #[derive(Debug)]
 pub(crate) enum PushContent {
-    /// What is in its tree.
+    /// Content of the pushed tree.
     Tree(PushedDirectory),
     /// Name of a package of the archive.
     Packaged(String),
@@ -46,7 +46,7 @@ impl PushContent {
     fn name(&self) -> String {
         match self {
             Self::Tree(pushed) => {
-                let packages = pushed::sort_by_importance(pushed.packages());
+                let packages = pushed_packages::sort_by_importance(pushed.packages());
                 packages.into_iter().next().unwrap_or_default()
             }
             Self::Packaged(name) => name.clone(),
@@ -67,8 +67,8 @@ impl Builder {
     /// package lists may take minutes once a day.
     ///
     /// # Errors
-    /// It is no package, does not fit the base, does not say which of several programs to run, or has dependencies that
-    /// are known to be provided by nothing.
+    /// It is no package, does not fit the base, does not say which of several programs to run, selects a middleware
+    /// that the bus does not speak, or has dependencies that are known to be provided by nothing.
     pub async fn inspect(
         &self,
         request: &PushRequest,
@@ -86,19 +86,22 @@ impl Builder {
         if let Some(note) = note {
             progress.warn(note).await;
         }
+        middleware::check_options(request, base.ros)?;
         let foundation = Foundation::combine(&request.underlays, &base)?;
         // Before anything is downloaded: what was pushed may not be a package at all.
         let content = match &request.source {
             PushSource::Tree(path) => {
                 let (tree, of, on) = (path.clone(), Arc::clone(&asked), base.clone());
-                let inspect = move || pushed::inspect_pushed(&tree, &on, &of.package_query());
+                let inspect = move || pushed_packages::inspect_pushed(&tree, &on, &of.package_query());
                 let InspectedTree { mut pushed, left_out } = blocking::spawn_reader(inspect).await??;
+                middleware::check_packages(pushed.packages(), request, base.ros)?;
                 if let PushedDirectory::Source(workspace) = pushed {
                     tell_selection(&workspace, &left_out, progress).await;
                     foundation.check_packages(&workspace.packages)?;
                     let (of, on) = (Arc::clone(&asked), base.clone());
                     let read = move || {
                         ask_what_to_run(&of, &workspace, &on)?;
+                        middleware::check_sources(&workspace, &of, on.ros)?;
                         let problems = find_source_problems(&of, &workspace, &on)?;
                         Ok::<_, Error>((workspace, problems))
                     };
@@ -170,8 +173,8 @@ async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &P
         return;
     }
     let built = workspace.packages.len();
-    let more = if left_out.len() > NAMED { ", …" } else { "" };
-    let names = left_out[..left_out.len().min(NAMED)].join(", ");
+    let more = if left_out.len() > MAX_NAMED_PACKAGES { ", …" } else { "" };
+    let names = left_out[..left_out.len().min(MAX_NAMED_PACKAGES)].join(", ");
     let all = built + left_out.len();
     progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
 }
@@ -219,12 +222,12 @@ fn check_dependencies(
     let Some(mut there) = there.or(base.has_distributions_ros().then(IndexedPackages::default)) else {
         return Ok(());
     };
-    let own = pushed::names(pushed.packages());
-    let mut asked = pushed::required_keys(pushed.packages());
+    let own = pushed_packages::names(pushed.packages());
+    let mut asked = pushed_packages::required_keys(pushed.packages());
     if matches!(pushed, PushedDirectory::Installed(_)) {
         // It is compiled already.
         asked.build.clear();
-        there.build = pushed::build_tools(&asked);
+        there.build = pushed_packages::build_tools(&asked);
     }
     foundation.add_to(&mut there);
     keys::resolve_keys(archive, base, &request.map, &own, &asked, &there)?;

@@ -262,9 +262,9 @@ fn parse_reply(text: &[u8], ros: Version) -> Result<LaunchAnswer, Error> {
 #[cfg(test)]
 mod composed;
 #[cfg(test)]
-mod of_one;
+mod ros1_tests;
 #[cfg(test)]
-mod of_two;
+mod ros2_tests;
 
 #[cfg(test)]
 mod tests {

@@ -30,7 +30,7 @@ pub(crate) struct PluginLibrary {
 /// Returns the libraries of a plugin list (pluginlib: a single `library`, or several in `class_libraries`); empty for
 /// other files.
 pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<PluginLibrary> {
-    let Ok(document) = roxmltree::Document::parse(text) else {
+    let Ok(document) = package::xml::parse(text) else {
         return BTreeSet::new();
     };
     let root = document.root_element();

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use package::system::HIDDEN;
+use package::system::HIDDEN_DIRECTORIES;
 use package::workspace::{InstallSpace, Layout};
 
 use crate::build::{Build, BuildParts};
@@ -16,17 +16,17 @@ use crate::key::{self, Key};
 use crate::keys::{self, RequiredKeys};
 use crate::modes::set_mode;
 use crate::workshop::PackJob;
-use crate::{pushed, source};
+use crate::{pushed_packages, source};
 
 /// Packs the install space and finds its dependencies.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<BuildParts, Error> {
-    let packages = pushed::sort_by_importance(&space.packages);
+    let packages = pushed_packages::sort_by_importance(&space.packages);
     let prefix = choose_prefix(&space, &build.base.build.prefix, &packages)?;
-    let (own, asked) = (pushed::names(&space.packages), pushed::required_keys(&space.packages));
+    let (own, asked) = (pushed_packages::names(&space.packages), pushed_packages::required_keys(&space.packages));
     // It is compiled already: its build dependencies do not matter.
     let asked = RequiredKeys { build: BTreeMap::new(), ..asked };
     let there = IndexedPackages {
-        build: pushed::build_tools(&asked),
+        build: pushed_packages::build_tools(&asked),
         run: build.indexed_packages(&build.base_diff_ids()).await?,
         modules: build.indexed_modules(&build.base_diff_ids()).await?,
     };
@@ -34,14 +34,14 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
     for warning in &resolved.warnings {
         build.progress.warn(warning.as_str()).await;
     }
-    let python = pushed::has_python(&space.root);
+    let python = pushed_packages::has_python(&space.root);
     let package = pack_space(build, &space, &prefix).await?;
     let libraries = source::needed_libraries(build, &package).await?;
     let needs = source::runtime_needs(build, &resolved, (libraries, python)).await?;
     let dependencies = source::dependencies(build, &needs).await?;
     Ok(BuildParts {
         packages,
-        versions: pushed::versions(&space.packages),
+        versions: pushed_packages::versions(&space.packages),
         dependencies,
         package,
         prefix: Some(prefix),
@@ -56,7 +56,7 @@ fn choose_prefix(space: &InstallSpace, otherwise: &Path, packages: &[String]) ->
         return Ok(otherwise.to_owned());
     };
     let is_usable = prefix.is_absolute() && prefix != Path::new("/");
-    let is_hidden = HIDDEN.iter().any(|hidden| prefix.starts_with(hidden));
+    let is_hidden = HIDDEN_DIRECTORIES.iter().any(|hidden| prefix.starts_with(hidden));
     match space.layout {
         _ if is_usable && !is_hidden => Ok(prefix.clone()),
         Layout::Merged | Layout::Isolated => Ok(otherwise.to_owned()),
@@ -95,7 +95,7 @@ async fn pack_space(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> R
     crate::blocking::spawn(move || compile::make_readable(&opened)).await??;
     let packing = PackJob {
         key,
-        made_from: pushed::names(&space.packages).into_iter().collect(),
+        made_from: pushed_packages::names(&space.packages).into_iter().collect(),
         tree,
         options: compile::package_options(&build.base, 0),
         directory,

@@ -15,9 +15,9 @@
 mod describe;
 mod feed;
 mod frames;
-mod heard;
 mod incomplete;
 mod lender;
+mod output_messages;
 mod plausible;
 mod settle;
 
@@ -41,10 +41,10 @@ use tokio::time::Instant;
 pub use settle::wait_until_still;
 
 use feed::InputFeed;
-use heard::OutputRecord;
+use output_messages::OutputRecord;
 
 /// Number of messages of an output kept between two observations.
-const KEPT: usize = 8;
+const OUTPUT_HISTORY: usize = 8;
 /// Maximum number of rounds; each provides what the previous one made a node request.
 const MOST_ROUNDS: usize = 12;
 
@@ -378,7 +378,7 @@ impl ProbeRun<'_> {
             }
             let asked = Instant::now();
             for topic in &new {
-                match self.bus.subscribe(topic, WireType::any(), QosProfile::keep_last(KEPT)).await {
+                match self.bus.subscribe(topic, WireType::any(), QosProfile::keep_last(OUTPUT_HISTORY)).await {
                     Ok(subscription) => {
                         self.subscriptions.insert(topic.clone(), subscription);
                     }

@@ -87,7 +87,7 @@ wait $!
 "#;
 
 /// Exit status of the shell if the program does not exist.
-const NOT_FOUND: i32 = 127;
+const EXIT_NOT_FOUND: i32 = 127;
 
 /// Runs a program that mounts file systems, in separate mount and PID namespaces: no other process of this machine can
 /// keep its mounts busy, and neither mounts nor processes outlive it or the daemon.
@@ -112,7 +112,7 @@ pub(crate) async fn run_in_namespaces(
         };
     }
     let ended = run_to_end(inside, "util-linux", on_line).await?;
-    if ended.status.code() == Some(NOT_FOUND) {
+    if ended.status.code() == Some(EXIT_NOT_FOUND) {
         return Err(missing_program(program, package));
     }
     ended.outcome(program)

@@ -100,7 +100,7 @@ impl Default for PushSource {
     }
 }
 
-/// What was built.
+/// Result of a build.
 #[derive(Debug)]
 pub enum BuildResult {
     /// The image of a service.
@@ -114,13 +114,13 @@ pub enum BuildResult {
 pub struct BuiltUnderlay {
     /// Main package, whose name is the default name of the underlay.
     pub package: String,
-    /// What others need to know to stand on it.
+    /// Facts for packages that are built upon it.
     pub contents: UnderlayContents,
     /// Base and ROS flavour.
     pub flavour: Flavour,
     /// Digest of the image with all its layers in the store, untagged. Nothing can be run in it: it keeps the layers.
     pub image: Digest,
-    /// Its own layers.
+    /// Layers of the underlay itself.
     pub layers: Vec<BuiltLayer>,
     /// Guard that protects the image from the garbage collector until it is tagged.
     pub hold: image::GcHold,

@@ -15,13 +15,13 @@ use crate::bootstrap::EPOCH;
 use crate::error::Error;
 
 /// Names of version control directories, and of files that point to them.
-const LEFT_OUT: [&str; 4] = [".git", ".hg", ".svn", ".bzr"];
+const VERSION_CONTROL: [&str; 4] = [".git", ".hg", ".svn", ".bzr"];
 
 /// Seals a pushed tree of sources. Blocking.
 pub(crate) fn seal(root: &Path) -> Result<(), Error> {
     let mut left_out = Vec::new();
     foreign::walk(root, |entry| {
-        if LEFT_OUT.iter().any(|name| entry.name() == OsStr::new(name)) {
+        if VERSION_CONTROL.iter().any(|name| entry.name() == OsStr::new(name)) {
             left_out.push(entry.display_path());
             return Ok(Visit::Skip);
         }

@@ -23,15 +23,16 @@ use crate::error::Error;
 use crate::install::LayerSet;
 use crate::keys::{self, ResolvedKeys};
 use crate::needs::RuntimeNeeds;
-use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
+use crate::{advice, elf, indexed, packaged, pushed_packages, units, wheels};
 
 /// Compiles and packs the workspace.
 pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<BuildParts, Error> {
-    let (own, asked) = (pushed::names(&workspace.packages), pushed::required_keys(&workspace.packages));
+    let (own, asked) =
+        (pushed_packages::names(&workspace.packages), pushed_packages::required_keys(&workspace.packages));
     let (packages, versions, python) = (
-        pushed::sort_by_importance(&workspace.packages),
-        pushed::versions(&workspace.packages),
-        pushed::has_python(&workspace.root),
+        pushed_packages::sort_by_importance(&workspace.packages),
+        pushed_packages::versions(&workspace.packages),
+        pushed_packages::has_python(&workspace.root),
     );
     let tools = toolchain(build, &workspace).await?;
     let mut there = build.find_known_packages(&tools).await?;

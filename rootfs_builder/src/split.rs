@@ -9,11 +9,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::debian_package::{Deb, Relations};
 
 /// Minimum number of packages worth a separate layer.
-const FEW: usize = 8;
+const MIN_PACKAGES: usize = 8;
 
 /// Returns whether this number of packages can be worth a division.
 pub(crate) fn is_worth_splitting(count: usize) -> bool {
-    count > FEW
+    count > MIN_PACKAGES
 }
 
 /// Divides `debs`; both parts keep the order. The first part is empty if a division is not worthwhile. `of_ros` tells
@@ -53,7 +53,7 @@ pub(crate) fn split(
         }
     }
     let (last, first): (Vec<Deb>, Vec<Deb>) = debs.iter().cloned().partition(|deb| late.contains(deb.name.as_str()));
-    if !is_worth_splitting(debs.len()) || first.len() < FEW || last.is_empty() {
+    if !is_worth_splitting(debs.len()) || first.len() < MIN_PACKAGES || last.is_empty() {
         (Vec::new(), debs.to_vec())
     } else {
         (first, last)

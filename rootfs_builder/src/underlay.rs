@@ -38,7 +38,7 @@ pub struct UnderlayContents {
     /// Diff-ids of the base's layers if it was made from an image, which another import may replace.
     #[serde(default)]
     pub(crate) image: Vec<Digest>,
-    /// Its ROS packages and those of the underlays below it, each with its layer in images.
+    /// ROS packages of the underlay and of those below it, each with its layer in images.
     pub packages: BTreeMap<String, Digest>,
     /// Install spaces of the underlays below it and its own, lowest first.
     pub layers: Vec<UnderlayLayer>,
@@ -48,7 +48,7 @@ pub struct UnderlayContents {
     pub(crate) modules: BTreeSet<String>,
     /// Debian packages for compiling upon it.
     pub(crate) build: BTreeSet<String>,
-    /// What its packages need at run time.
+    /// Needs of its packages at run time.
     pub(crate) run: RuntimeNeeds,
 }
 
@@ -57,7 +57,7 @@ pub struct UnderlayContents {
 pub struct NamedUnderlay {
     /// Name of the underlay.
     pub name: String,
-    /// Its contents.
+    /// Contents of the underlay.
     pub contents: UnderlayContents,
 }
 

@@ -55,9 +55,9 @@ const ABSENT: [&str; 7] = [
 struct WorkspaceUnits {
     root: PathBuf,
     units: Vec<BuildUnit>,
-    /// For each package, its direct and indirect dependencies among the earlier ones.
+    /// Direct and indirect dependencies of each package among the earlier ones.
     needs: Vec<Vec<usize>>,
-    /// For each package, the hash of its own sources.
+    /// Hash of each package's own sources.
     sources: Vec<String>,
     /// Hash of everything that was pushed.
     all: String,
@@ -236,7 +236,7 @@ fn link_tree(from: &Path, to: &Path, skip: &BTreeSet<PathBuf>) -> Result<(), Err
 pub(crate) struct CompiledWorkspace {
     /// Layer of the image.
     pub(crate) package: LayerSet,
-    /// The same as part of an underlay, if it becomes one.
+    /// Layer as a part of an underlay, if it becomes one.
     pub(crate) underlay: Option<UnderlayLayer>,
 }
 

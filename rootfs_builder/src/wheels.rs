@@ -11,6 +11,7 @@ use servant::container::{Mount, Profile};
 
 use crate::base::{Base, Wheels};
 use crate::bootstrap::{EPOCH, tree_options};
+use crate::cache_cleanup::{self, DOWNLOADS};
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::install::{LayerSet, link_or_copy, write_tree};
@@ -19,7 +20,6 @@ use crate::modes::set_mode;
 use crate::process::{self, Stream};
 use crate::requirements::Requirements;
 use crate::sandbox::SandboxRun;
-use crate::unused::{self, DOWNLOADS};
 use crate::workshop::{BuildContext, PackJob};
 
 const INSTALL: &str = include_str!("inside/wheels.py");
@@ -153,7 +153,7 @@ async fn cached_wheels(place: &Path, wanted: &Requirements) -> Result<Option<Vec
             }
         }
         let whole = found.len() == wanted.len();
-        found.values().for_each(|path| unused::mark_used(path));
+        found.values().for_each(|path| cache_cleanup::mark_used(path));
         Ok(whole.then(|| found.into_values().collect()))
     })
     .await?

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use support::patience;
 
 /// Time after which a story is reported, and the interval of further reports.
-const LONG: Duration = Duration::from_secs(300);
+const REPORT_INTERVAL: Duration = Duration::from_secs(300);
 /// Maximum factor by which a slow machine extends the time limit of a story: a complete check has an hour and a half.
 const SLOWEST: f64 = 2.0;
 /// Interval between two checks.
@@ -93,7 +93,7 @@ impl RunningStories {
             if time > too_long {
                 return Some(story);
             }
-            if time > LONG * (watched.named + 1) {
+            if time > REPORT_INTERVAL * (watched.named + 1) {
                 watched.named += 1;
                 println!("still being told after {} s: {story}", time.as_secs());
             }

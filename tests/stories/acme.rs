@@ -4,7 +4,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
 use anyhow::{Context, ensure};
-use support::acme::AcmeDirectory;
+use support::acme::{AcmeDirectory, PebbleServer};
 use support::daemon::Daemon;
 use support::deployer::{CommandOutcome, run};
 use support::machine::free_port;
@@ -13,7 +13,7 @@ use support::world::world;
 use support::{Verdict, wait_until};
 
 const NAME: &str = "robots.lab.example";
-const LONG: u64 = 90 * 86_400;
+const CERTIFICATE_SECONDS: u64 = 90 * 86_400;
 const TOKENS: &str = "tokens = [\"open sesame\"]\n";
 
 fn port(daemon: &Daemon) -> anyhow::Result<u16> {
@@ -60,7 +60,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
         "its own is for other names"
     );
     // A server that does not find this machine under the name.
-    let lost = directory.start(free_port()?, LONG)?;
+    let lost = directory.start(free_port()?, CERTIFICATE_SECONDS)?;
     wait_for_event(
         &daemon,
         "certificate-not-renewed",
@@ -78,7 +78,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     })?;
     drop(brief);
     // The server may also validate at the portal's own port.
-    let lasting = directory.start(port(&daemon)?, LONG)?;
+    let lasting = directory.start(port(&daemon)?, CERTIFICATE_SECONDS)?;
     let root = lasting.root();
     wait_until("a certificate of the other authority", || {
         let answer = curl(&daemon, &root)?;
@@ -140,4 +140,23 @@ pub fn what_cannot_be_asked_for_is_said_at_the_start() -> Verdict {
         ensure!(refused.contains(words), "{words}: {refused}");
     }
     Ok(())
+}
+
+pub fn what_it_is_tested_with_ends_with_who_started_it() -> Verdict {
+    let directory = AcmeDirectory::new()?;
+    let mut started = std::thread::scope(|scope| {
+        // As in a run that is killed, nobody ends them.
+        let starter =
+            scope.spawn(|| directory.start(free_port()?, CERTIFICATE_SECONDS).map(PebbleServer::into_processes));
+        starter.join().map_err(|_| anyhow::anyhow!("it panicked"))?
+    })?;
+    ensure!(started.len() == 2, "{started:?}");
+    wait_until("the end of Pebble", || {
+        for process in &mut started {
+            if process.try_wait()?.is_none() {
+                return Ok(Err(format!("{process:?} runs")));
+            }
+        }
+        Ok(Ok(()))
+    })
 }

@@ -154,6 +154,31 @@ pub fn a_package_whose_programs_are_not_found_is_refused_at_once() -> Verdict {
     Ok(())
 }
 
+/// Tier 1 since Kilted; a servant's nodes would be reached by nobody.
+pub fn nodes_that_speak_zenoh_are_refused_before_a_build() -> Verdict {
+    let daemon = world().ensure_shared()?;
+    let place = tempfile::tempdir()?;
+    let refuse = |options: &[&str], words: &[&str]| -> Verdict {
+        let push = [&["push", path_str(place.path())][..], options].concat();
+        let refused = daemon.deployer().run(&push)?.expect_failure(words)?;
+        ensure!(refused.status == 6 && !refused.output().contains("compiling"), "{refused:#?}");
+        Ok(())
+    };
+    let package = [("__init__.py", ""), ("node.py", "def main():\n    pass\n")];
+    let needs = "<depend>rclpy</depend><exec_depend>rmw_zenoh_cpp</exec_depend>";
+    write_python_package(place.path(), "lab_zenoh", needs, ("lab_zenoh", &package))?;
+    let speaks = "rmw_zenoh_cpp speaks Zenoh, and Cloudroid speaks DDS only";
+    let depends = ["package lab_zenoh depends on rmw_zenoh_cpp at run time", speaks, "--map rmw_zenoh_cpp="];
+    refuse(&["--node", "go"], &depends)?;
+    let launch = "from launch import LaunchDescription\nfrom launch.actions import SetEnvironmentVariable\n\n\n\
+                  def generate_launch_description():\n    return LaunchDescription([\n\
+                  \x20       SetEnvironmentVariable('RMW_IMPLEMENTATION', 'rmw_zenoh_cpp'),\n    ])\n";
+    write_files(&place.path().join("src/lab_zenoh/launch"), &[("go.launch.py", launch.to_owned())])?;
+    let sets = ["launch file launch/go.launch.py sets RMW_IMPLEMENTATION", speaks, "set it to rmw_fastrtps_cpp"];
+    refuse(&["--launch", "go.launch.py", "--map", "rmw_zenoh_cpp="], &sets)?;
+    Ok(())
+}
+
 /// robot_pose_ekf was only asked about after eleven minutes.
 pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     let daemon = world().ensure_shared()?;

@@ -15,6 +15,7 @@ use support::world::{ADDER, SEER, world};
 use support::{Verdict, binaries, procfs};
 
 use crate::access::{create_token, push_adder, run_with_token};
+use crate::survival::expect_nothing_left;
 
 /// A running `cloudroidctl exec`, or a terminal around it.
 struct ExecProcess {
@@ -273,4 +274,32 @@ pub fn who_may_not_is_refused_and_who_may_no_longer_is_ended() -> Verdict {
     let refused = daemon.deployer().run(&["exec", &servant, "--", "true"])?;
     refused.expect_failure(&["no programs can be run in servants here", "[portal]"])?;
     Ok(())
+}
+
+pub fn a_program_ends_with_a_daemon_that_is_killed() -> Verdict {
+    let setup = world().setup("exec-killed").config("keep_servants = true\n");
+    let first = setup.start()?;
+    first.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
+    let (_robot, servant) = working_servant(&first, "adder_py", "", "r1")?;
+    let script = "(setsid sleep 4718 &); echo up; exec sleep 4718";
+    let mut sleeper = ExecProcess::start_command(&first, &servant, &["sh", "-c", script])?;
+    sleeper.hears("up")?;
+    let pids = support::wait_until("both programs", || {
+        let pids = pids_with(&first, &servant, "sleep 4718")?;
+        Ok(if pids.len() == 2 { Ok(pids) } else { Err(format!("{pids:?}")) })
+    })?;
+    first.kill()?;
+    let status = sleeper.wait()?;
+    ensure!(!status.success(), "{status}");
+    support::wait_until("the end of the programs", || {
+        let left: Vec<&i32> = pids.iter().filter(|pid| procfs::is_running(**pid)).collect();
+        Ok(if left.is_empty() { Ok(()) } else { Err(format!("{left:?} run")) })
+    })?;
+    // The servant has survived, and the next daemon runs programs in it.
+    let second = setup.start()?;
+    let (_robot, adopted) = working_servant(&second, "adder_py", "", "r1")?;
+    ensure!(adopted == servant, "{adopted} instead of {servant}");
+    let told = second.deployer().run(&["exec", &servant, "--", "echo", "here"])?.expect_success()?;
+    ensure!(told.stdout == "here\n", "{told:#?}");
+    expect_nothing_left(second)
 }

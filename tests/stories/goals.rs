@@ -36,13 +36,13 @@ impl GoalEvents for GoalRecord {
     }
 }
 
-/// Returns the number at the end of a feedback or result.
-fn last_number(message: &[u8]) -> Option<i32> {
+/// Returns the number at the end of a goal, feedback or result.
+pub fn last_number(message: &[u8]) -> Option<i32> {
     Some(i32::from_le_bytes(*message.last_chunk()?))
 }
 
 /// Returns the action of the crossing node of ROS `there`, as nodes of ROS `here` know it.
-fn action_type(here: RosVersion, there: RosVersion) -> anyhow::Result<Arc<ActionDef>> {
+pub fn action_type(here: RosVersion, there: RosVersion) -> anyhow::Result<Arc<ActionDef>> {
     let (package, name, text) = match there {
         RosVersion::One => ("actionlib", "Test", "int32 goal\n---\nint32 result\n---\nint32 feedback\n"),
         RosVersion::Two => ("test_msgs", "Fibonacci", "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"),

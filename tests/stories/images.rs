@@ -211,7 +211,7 @@ pub fn a_saved_image_becomes_a_base() -> Verdict {
         (&["base", "import", "lab", "--from", &at("torn.tar")], &["truncated"]),
         (&["base", "import", "../lab", "--from", &at("image.tar")], &["is no name of a base"]),
         (&["base", "import", BASE, "--from", &at("image.tar")], &["there is a base", "choose another name"]),
-        (&["base", "import", "lab", "--from", "docker://ros:jazzy"], &["skopeo copy docker://", "oci-archive:"]),
+        (&["base", "import", "lab", "--from", "docker://ros:jazzy"], &["names no registry"]),
     ];
     for (words, expected) in rows {
         types(words)?.expect_failure(expected)?;
@@ -253,6 +253,50 @@ pub fn a_saved_image_becomes_a_base() -> Verdict {
     hear_courier(&other, "courier_ros2")?;
     let recorded = types(&["--format", "json", "audit", "-n", "100"])?.expect_success()?.stdout;
     ensure!(recorded.contains("\"base lab\""), "{recorded}");
+    other.stop()?;
+    Ok(())
+}
+
+pub fn an_image_of_a_registry_becomes_a_base() -> Verdict {
+    // A daemon's own images, of which each has a base and a package.
+    let registry = world().setup("registry-of-bases").start()?;
+    registry.deployer().push("courier_ros2", COURIER.arguments)?.expect_success()?;
+    create_token(&registry, &["chief", "--role", "admin"])?;
+    let lab = create_token(&registry, &["lab", "--role", "viewer", "--service", "courier_*"])?;
+    let place = world().directory("pulled")?;
+    let other = offline_setup("base-of-a-registry", place.path(), "pulled")?.start()?;
+    let passwords = place.path().join("auth.json");
+    let imports = |image: &str| {
+        run(Command::new(binaries::path("cloudroidctl"))
+            .args(["base", "import", "pulled", "--from", &format!("docker://{}/{image}", registry.address)])
+            .env("CLOUDROID_HOME", &other.home)
+            .env("REGISTRY_AUTH_FILE", &passwords)
+            .env_remove("CLOUDROID_SERVER"))
+    };
+    imports("courier_ros2:latest")?.expect_failure(&["asks for a password", "--user"])?;
+    // Another client logs in, and leaves the password where all of them look.
+    run(Command::new("skopeo")
+        .args(["login", "--tls-verify=false", "-u", "lab", "-p", &lab, "--authfile"])
+        .arg(&passwords)
+        .arg(&registry.address))?
+    .expect_success()?;
+    imports("courier_ros2:99")?.expect_failure(&["404", "there is no image courier_ros2:99"])?;
+    imports("vault:latest")?.expect_failure(&["may not see service vault"])?;
+    other.deployer().run(&["bases", "show", "pulled"])?.expect_failure(&["no base \"pulled\""])?;
+
+    let imported = imports("courier_ros2:latest")?.expect_success()?;
+    let pulled = format!("pulling {}/courier_ros2:latest", registry.address);
+    ensure!(imported.stderr.contains(&pulled), "{}", imported.output());
+    let base = other.deployer().run_json(&["bases", "show", "pulled"])?;
+    let summary = base["summary"].as_str().unwrap_or_default();
+    ensure!(summary.contains(&format!("image {}/courier_ros2:latest", registry.address)), "{summary}");
+    ensure!(base["ros_packages"]["rclpy"].is_string() && base["ros_packages"]["courier_ros2"].is_string(), "{base:#}");
+    registry.stop()?;
+    // What is in the image runs without a build.
+    let arguments = ["push", "--apt", "courier_ros2", "--base", "pulled", "--node", "courier"];
+    other.deployer().run(&arguments)?.expect_success()?;
+    hear_courier(&other, "courier_ros2")?;
+    ensure!(!place.path().join(CALLED).exists(), "{}", std::fs::read_to_string(place.path().join(CALLED))?);
     other.stop()?;
     Ok(())
 }

@@ -1,22 +1,30 @@
 //! A robot of one ROS uses a service of the other by a stub, as if both were of the same. The servant's node, the
 //! robot's nodes and its original are real ones of their ROS.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use anyhow::{Context, ensure};
-use ros::bus::{GoalOutcome, ParamValue, Publisher, RosVersion};
+use bytes::Bytes;
+use ros::bus::{
+    ActionHandler, ActionServer, Bus, FailureReason, GoalEnd, GoalOutcome, ParamValue, Publisher, RosVersion,
+};
 use support::Verdict;
 use support::cable::Cable;
 use support::daemon::Daemon;
 use support::layout::MessageLayout;
-use support::patience::Deadline;
+use support::patience::{Deadline, wait_for};
 use support::ros_system::HasBus;
 use support::site::{NodeProcess, Site, string_text};
 use support::twins::{Twin, call_trigger};
-use support::world::world;
+use support::world::{PEOPLE, world};
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 
 use crate::calls::{TriggerService, serve_trigger};
-use crate::crossing::{self, advertise, find_type, is_same, point_message, wait_for_answer, with_log};
+use crate::crossing::{self, MessageBytes, advertise, find_type, is_same, point_message, wait_for_answer, with_log};
 use crate::fallback::{MapRobot, SILENT, localiser, wait_for_log};
-use crate::goals::GoalApplication;
+use crate::goals::{GoalApplication, action_type, last_number};
 
 const NODE: &str = "/crossing";
 
@@ -155,6 +163,100 @@ pub fn a_node_calls_a_robot_of_the_other_ros(ros: RosVersion) -> Verdict {
     Ok(())
 }
 
+/// A goal with its number of steps, or a cancel, without one.
+type AskedGoal = (String, Option<i32>);
+
+/// Passes goals on to the arm.
+struct GoalQueue(mpsc::UnboundedSender<AskedGoal>);
+
+impl ActionHandler for GoalQueue {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
+        let steps = last_number(&goal).ok_or_else(|| FailureReason::new("it has no number"))?;
+        let _ = self.0.send((id.to_owned(), Some(steps)));
+        Ok(())
+    }
+
+    fn on_cancel(&self, id: &str) {
+        let _ = self.0.send((id.to_owned(), None));
+    }
+
+    fn on_failed(&self, _reason: &str) {}
+}
+
+/// A server on the robot of the action that nodes of the other ROS look for.
+struct Arm {
+    ros: RosVersion,
+    server: Box<dyn ActionServer>,
+    asked: mpsc::UnboundedReceiver<AskedGoal>,
+}
+
+impl Arm {
+    /// Starts to serve the action.
+    fn start(site: &Site, node: &Arc<dyn Bus>) -> anyhow::Result<JoinHandle<()>> {
+        let ros = site.system.version();
+        let (asks, asked) = mpsc::unbounded_channel();
+        let _runtime = site.runtime.enter();
+        let of = action_type(ros, ros.other())?;
+        let server = node.serve_action("/robot/act", &of, Arc::new(GoalQueue(asks)))?;
+        Ok(site.runtime.spawn(Self { ros, server, asked }.work()))
+    }
+
+    /// Carries out goals of a few steps at once, and works on the others until they are cancelled.
+    async fn work(mut self) {
+        let mut working = None;
+        let mut period = tokio::time::interval(Duration::from_millis(20));
+        loop {
+            tokio::select! {
+                asked = self.asked.recv() => match asked {
+                    Some((id, Some(steps))) if steps < 10 => self.end(&id, GoalOutcome::Succeeded, steps),
+                    Some((id, Some(_))) => working = Some(id),
+                    Some((id, None)) => {
+                        working = None;
+                        self.end(&id, GoalOutcome::Canceled, -1);
+                    }
+                    None => return,
+                },
+                _ = period.tick() => {
+                    if let Some(id) = &working {
+                        self.server.publish_feedback(id, self.message(1));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Returns a result or feedback with one number, which is in a list in the actions of ROS 2.
+    fn message(&self, number: i32) -> Bytes {
+        let mut out = MessageLayout::new(self.ros);
+        if self.ros == RosVersion::One {
+            out.u32(1);
+        }
+        out.u32(u32::from_le_bytes(number.to_le_bytes())).finish()
+    }
+
+    fn end(&self, id: &str, outcome: GoalOutcome, number: i32) {
+        self.server.end_goal(id, GoalEnd { outcome, text: String::new(), result: self.message(number) });
+    }
+}
+
+pub fn a_node_sends_goals_to_a_robot_of_the_other_ros(ros: RosVersion) -> Verdict {
+    let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
+    let site = Site::with_ros(ros)?;
+    let (app, arm) = (site.join("/app")?, site.join("/arm")?);
+    let working = Arm::start(&site, &arm)?;
+    let stub = start_crossing(&site, &daemon, "goals", &[])?;
+    wait_until_ready(&site, &app, &stub)?;
+    for (service, wanted) in [("/crossing/send", "3"), ("/crossing/stop", "-1")] {
+        let ready = site.wait_for_graph(&app, "the node's service", |graph| graph.serves(service));
+        with_log(ready.map(drop), &stub)?;
+        let (success, said) = with_log(call_trigger(&site, &app, service), &stub)?;
+        ensure!(success && said == wanted, "{service}: {said}\n{}", stub.output());
+    }
+    ensure!(!working.is_finished(), "the robot's server has ended\n{}", stub.output());
+    working.abort();
+    Ok(())
+}
+
 pub fn simulated_time_is_the_robots(ros: RosVersion) -> Verdict {
     let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
     let site = Site::with_ros(ros)?;
@@ -225,13 +327,103 @@ pub fn parameters_of_the_node_are_the_robots(ros: RosVersion) -> Verdict {
                 graph.serves("/crossing/set_parameters") && graph.serves("/crossing/get_parameter_types")
             });
             with_log(served.map(drop), &stub)?;
+            // The node's events are on the robot, as in ROS 2 any node's.
+            let heard = site.runtime.block_on(app.node_parameters()?.watch(Some(NODE)));
+            let mut heard = with_log(heard.map_err(Into::into), &stub)?;
             let change = vec![("label".to_owned(), Some(label("rear")))];
             let set = site.runtime.block_on(app.node_parameters()?.set(NODE, change));
             let set = with_log(set.map_err(Into::into), &stub)?;
             ensure!(set.iter().all(Result::is_ok), "{set:?}");
+            let event = with_log(site.runtime.block_on(wait_for(heard.next())), &stub)?;
+            let changed = event.context("the events ended")?.changed;
+            ensure!(changed == [("label".to_owned(), label("rear"))], "{changed:?}");
         }
     }
     wait_for_label(&site, &app, &stub, "rear")
+}
+
+pub fn a_node_of_ros_2_is_reconfigured_by_a_robot_of_ros_1() -> Verdict {
+    let daemon = world().daemon_with(crossing::service(RosVersion::Two).0)?;
+    let site = Site::new()?;
+    let app = site.join("/app")?;
+    let stub = start_crossing(&site, &daemon, "reconfigured", &["_label:=front"])?;
+    wait_until_ready(&site, &app, &stub)?;
+    let there = site.wait_for_graph(&app, "dynamic_reconfigure", |graph| {
+        graph.serves("/crossing/set_parameters") && graph.publishes(NODE, "/crossing/parameter_descriptions")
+    });
+    with_log(there.map(drop), &stub)?;
+    // As rqt_reconfigure does: what there is, what is so, and a change.
+    let mut descriptions = site.subscribe(&app, "/crossing/parameter_descriptions")?;
+    let described = with_log(site.next_message(&mut descriptions), &stub)?;
+    ensure!(described.wire_type.name == "dynamic_reconfigure/ConfigDescription", "{:?}", described.wire_type);
+    let label = MessageBytes::default().text("label").text("str").0;
+    ensure!(holds(&described.bytes, &label), "{described:?}");
+    let mut updates = site.subscribe(&app, "/crossing/parameter_updates")?;
+    let is_so = |text: &str| MessageBytes::default().text("label").text(text).0;
+    let now = with_log(site.next_message(&mut updates), &stub)?;
+    ensure!(holds(&now.bytes, &is_so("front")), "{now:?}");
+    // dynamic_reconfigure/Config: bools · ints · strs { name, value } · doubles · groups
+    let request = MessageBytes::default().word(0).word(0).word(1).text("label").text("left").word(0).word(0).0;
+    let response = with_log(site.call_service(&app, "/crossing/set_parameters", &request), &stub)?;
+    ensure!(holds(&response, &is_so("left")), "{response:?}");
+    wait_for_label(&site, &app, &stub, "left")?;
+    while !holds(&with_log(site.next_message(&mut updates), &stub)?.bytes, &is_so("left")) {}
+    // It stands at the robot's Master, too.
+    let told = support::wait_until("the label at the robot's Master", || {
+        let value = site.runtime.block_on(app.parameter("/crossing/label")).ok();
+        let is = value == Some(ParamValue::String("left".to_owned()));
+        Ok(is.then_some(()).ok_or_else(|| format!("{value:?}")))
+    });
+    with_log(told, &stub)
+}
+
+/// Returns whether a message contains these bytes.
+fn holds(message: &[u8], part: &[u8]) -> bool {
+    message.windows(part.len()).any(|some| some == part)
+}
+
+pub fn a_node_of_ros_1_is_reconfigured_by_a_robot_of_ros_2() -> Verdict {
+    let daemon = world().daemon_with(PEOPLE)?;
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
+    let stub = site.start_stub(
+        &daemon,
+        ("opencv_apps", "opencv_apps", "people_detect"),
+        "mixed-reconfigured",
+        &["--ros-args", "-r", "__node:=people", "-p", "debug_view:=false"],
+    )?;
+    let served = site.wait_for_graph(&app, "the services about parameters", |graph| {
+        ["set_parameters", "describe_parameters", "get_parameter_types"]
+            .iter()
+            .all(|service| graph.serves(&format!("/people/{service}")))
+    });
+    with_log(served.map(drop), &stub)?;
+    let parameters = app.node_parameters()?;
+    let name = || "padding".to_owned();
+    // Its node has to have advertised its parameters in the cloud.
+    let described = support::wait_until("the description of a parameter", || {
+        let described = site.runtime.block_on(parameters.describe("/people", &[name()]))?;
+        let range = described.first().and_then(|described| described.as_ref()?.integer_range);
+        Ok(range.ok_or_else(|| format!("{described:?}")))
+    });
+    let range = with_log(described, &stub)?;
+    ensure!(range.from < range.to, "{range:?}");
+    let heard = site.runtime.block_on(parameters.watch(Some("/people")));
+    let mut heard = with_log(heard.map_err(Into::into), &stub)?;
+    let change = |value| vec![(name(), Some(ParamValue::Int(value)))];
+    let set = site.runtime.block_on(parameters.set("/people", change(range.to)))?;
+    ensure!(set.iter().all(Result::is_ok), "{set:?}\n{}", stub.output());
+    // The node has chosen it. Its other parameters, which it writes again, have not changed.
+    loop {
+        let event = with_log(site.runtime.block_on(wait_for(heard.next())), &stub)?.context("the events ended")?;
+        if event.changed == [(name(), ParamValue::Int(range.to))] {
+            break;
+        }
+        ensure!(event.changed.iter().all(|(changed, _)| *changed != name()), "{event:?}");
+    }
+    let refused = site.runtime.block_on(parameters.set("/people", change(range.to + 1)))?;
+    ensure!(refused.iter().all(Result::is_err), "{refused:?}");
+    Ok(())
 }
 
 pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -> Verdict {

@@ -13,7 +13,7 @@ use support::world::world;
 use support::{Verdict, binaries, wait_until};
 
 pub const PASSWORD: &str = "four quiet purple engines";
-const OTHER: &str = "nine loud yellow kettles";
+const OTHER_PASSWORD: &str = "nine loud yellow kettles";
 const PATH: &str = "/api/v1/session";
 
 /// Runs a command for accounts, with a password on standard input.
@@ -127,7 +127,8 @@ pub fn people_sign_in_and_out() -> Verdict {
     let setup = world().setup("people");
     let daemon = setup.start()?;
     run_account(&daemon, &["create", "alice", "--role", "operator"], PASSWORD)?.expect_success()?;
-    run_account(&daemon, &["create", "eve", "--role", "viewer", "--service", "adder*"], OTHER)?.expect_success()?;
+    run_account(&daemon, &["create", "eve", "--role", "viewer", "--service", "adder*"], OTHER_PASSWORD)?
+        .expect_success()?;
     // From the first account on unauthenticated requests are refused.
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     let open = daemon.get_json(PATH)?;
@@ -138,7 +139,7 @@ pub fn people_sign_in_and_out() -> Verdict {
     ensure!(alice.cookie != invented && alice.cookie.starts_with("cloudroid="));
     ensure!(alice.is_signed_in()? && alice.request("GET", "/api/v1/services")?.0 == 200);
     ensure!(alice.request("GET", "/api/v1/tokens")?.0 == 403, "an operator");
-    let eve = SignedInBrowser::sign_in(&daemon, "eve", OTHER)?;
+    let eve = SignedInBrowser::sign_in(&daemon, "eve", OTHER_PASSWORD)?;
     ensure!(eve.request("GET", "/api/v1/status")?.0 == 403, "a viewer of some");
     // Signing in again creates a new session and ends the previous one.
     let again = SignedInBrowser::sign_in_with_headers(&daemon, "alice", PASSWORD, &[("Cookie", &alice.cookie)])?;
@@ -163,7 +164,7 @@ pub fn people_sign_in_and_out() -> Verdict {
     }
     let log = std::fs::read_to_string(daemon.home.join("daemon.log"))?;
     let state = String::from_utf8_lossy(&std::fs::read(daemon.home.join("cloudroid.db"))?).into_owned();
-    for secret in [PASSWORD, OTHER, alice.session_secret(), &alice.csrf] {
+    for secret in [PASSWORD, OTHER_PASSWORD, alice.session_secret(), &alice.csrf] {
         for (name, text) in [("audit log", &audited), ("log", &log), ("database", &state)] {
             ensure!(!text.contains(secret), "the {name} has a secret");
         }
@@ -190,8 +191,8 @@ pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
     let token = ["token", "create", "alice", "--role", "admin"];
     daemon.deployer().run(&token)?.expect_failure(&["already"])?;
     // The response for an unknown name is the same.
-    let wrong = request_sign_in(&daemon, "alice", OTHER, &[])?;
-    let unknown = request_sign_in(&daemon, "nobody", OTHER, &[])?;
+    let wrong = request_sign_in(&daemon, "alice", OTHER_PASSWORD, &[])?;
+    let unknown = request_sign_in(&daemon, "nobody", OTHER_PASSWORD, &[])?;
     ensure!(wrong.0 == 401 && wrong.2 == unknown.2, "{wrong:?} {unknown:?}");
     let long = "x".repeat(1025);
     for (body, status) in [
@@ -216,11 +217,11 @@ pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
     ensure!(disabled.0 == 401 && disabled.2 == wrong.2, "{disabled:?}");
     daemon.deployer().run(&["account", "enable", "alice"])?.expect_success()?;
     SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
-    run_account(&daemon, &["passwd", "alice"], OTHER)?.expect_success()?;
+    run_account(&daemon, &["passwd", "alice"], OTHER_PASSWORD)?.expect_success()?;
     ensure!(request_sign_in(&daemon, "alice", PASSWORD, &[])?.0 == 401);
-    SignedInBrowser::sign_in(&daemon, "alice", OTHER)?;
+    SignedInBrowser::sign_in(&daemon, "alice", OTHER_PASSWORD)?;
     daemon.deployer().run(&["account", "remove", "alice"])?.expect_success()?;
-    ensure!(request_sign_in(&daemon, "alice", OTHER, &[])?.0 == 401);
+    ensure!(request_sign_in(&daemon, "alice", OTHER_PASSWORD, &[])?.0 == 401);
     ensure!(daemon.get("/api/v1/services")?.0 == 401, "the door does not open again");
     for verb in ["remove", "disable", "enable"] {
         let typed = daemon.deployer().run(&["account", verb, "alice"])?;
@@ -235,7 +236,7 @@ pub fn who_guesses_passwords_is_slowed() -> Verdict {
     let alice = SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
     // Each wrong attempt doubles the waiting time: however slow this machine is, one comes too early.
     wait_until("who guesses to be slowed", || {
-        let (status, head, body) = request_sign_in(&daemon, "alice", OTHER, &[])?;
+        let (status, head, body) = request_sign_in(&daemon, "alice", OTHER_PASSWORD, &[])?;
         ensure!(status == 401 || status == 429, "{status} {body}");
         Ok(match status {
             429 if head.to_ascii_lowercase().contains("retry-after") => Ok(()),

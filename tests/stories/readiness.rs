@@ -13,7 +13,7 @@ use support::world::world;
 use tokio_tungstenite::tungstenite::Message;
 
 /// Longer than the time given to nodes that register less than expected.
-const LONG: Duration = Duration::from_secs(7);
+const SLOW_START: Duration = Duration::from_secs(7);
 
 /// Starts a daemon with our slow package, whose node waits for `1` and then `2` from the returned listener.
 fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
@@ -97,7 +97,7 @@ pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdi
     let mut node = wait_until_registered(&models)?;
     // The node runs and has contacted the Master, but the servant is not ready.
     let began = Instant::now();
-    while began.elapsed() < LONG {
+    while began.elapsed() < SLOW_START {
         let servant = daemon.servant_of("slow_py", "patient")?;
         ensure!(servant["phase"] == "starting", "taken for ready after {:?}: {servant:#}", began.elapsed());
         std::thread::sleep(Duration::from_millis(100));

@@ -1,9 +1,10 @@
 //! Invalid input: an error that names the problem and the next step, and no partial results.
 
+use std::io::Write;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 
-use anyhow::ensure;
+use anyhow::{Context, ensure};
 use support::daemon::{Daemon, DaemonSetup};
 use support::deployer::{path_str, run};
 use support::small_disk::SmallDisk;
@@ -140,6 +141,41 @@ pub fn reserved_and_taken_names() -> Verdict {
         .deployer()
         .push("leaver_py", &["--name", "adder_py", "--node", "leaver.py"])?
         .expect_failure(&["adder_py", "taken"])?;
+    Ok(())
+}
+
+pub fn an_import_of_a_base_leaves_space_on_the_disk() -> Verdict {
+    let disk = SmallDisk::mount("importing", "100M")?;
+    let daemon = DaemonSetup::new(&disk.home()).start()?;
+    let mut import = Command::new(binaries::path("cloudroidctl"))
+        .args(["base", "import", "robot", "--from", "-"])
+        .env("CLOUDROID_HOME", &daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    // The beginning of a system, which is kept while it arrives: less than a twentieth of the disk is left then.
+    let mut sent = import.stdin.take().context("its input")?;
+    let mut header = tar::Header::new_gnu();
+    header.set_path("usr/share/map.pgm")?;
+    header.set_size(1 << 30);
+    header.set_mode(0o644);
+    header.set_cksum();
+    sent.write_all(header.as_bytes())?;
+    let part = vec![1; 1 << 20];
+    // It may be refused before the last of it is sent.
+    let _ = (0..96).try_for_each(|_| sent.write_all(&part));
+    // More would come, but nobody waits for it.
+    let ended = import.wait_with_output()?;
+    drop(sent);
+    let said = String::from_utf8_lossy(&ended.stderr);
+    ensure!(!ended.status.success() && said.contains("no space") && said.contains("must stay free"), "{said}");
+    support::wait_until("nothing of it is left", || {
+        let left = std::fs::read_dir(daemon.home.join("build"))?.count();
+        Ok(if left == 0 { Ok(()) } else { Err(format!("{left} entries in build")) })
+    })?;
+    ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
     Ok(())
 }
 

@@ -58,7 +58,23 @@ pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
     // Registrations that every node has are not part of a service's interface.
     ensure!(names("topics")? == ["/greeting", "/name"] && names("services")? == ["/greet"], "{service:#}");
     ensure!(names("actions")? == ["/count"], "{service:#}");
-    let mut robot = daemon.robot("herald?robot=herald-asked")?;
+    ask_herald(&daemon, "herald")
+}
+
+/// A base of another distribution: other wheels for compiling interfaces and for running, and another Fast DDS.
+pub fn a_workspace_runs_on_kilted_as_on_jazzy() -> Verdict {
+    const BASE: &str = "bookworm-kilted-wheels";
+    let daemon = world().ensure_shared()?;
+    let arguments = ["--base", BASE, "--name", "kilted-herald", "--node", "herald/herald"];
+    daemon.deployer().push("herald_ros2", &arguments)?.expect_success()?;
+    let base = daemon.deployer().run_json(&["bases", "show", BASE])?;
+    ensure!(base["ros_packages"]["rclpy"].as_str().is_some_and(|version| version.starts_with("9.")), "{base:#}");
+    ask_herald(&daemon, "kilted-herald")
+}
+
+/// Calls a herald's service, hears its topic and sends it a goal, as a robot does by rosbridge.
+fn ask_herald(daemon: &Daemon, service: &str) -> Verdict {
+    let mut robot = daemon.robot(&format!("{service}?robot={service}-asked"))?;
     let greeted = robot.call("/greet", json!({"name": "robot"}))?;
     let greeting = &greeted["values"]["greeting"];
     ensure!(greeting["text"] == "Hello, robot" && greeting["wide"] == "HELLO, ROBOT", "{greeted}");

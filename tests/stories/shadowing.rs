@@ -1,10 +1,11 @@
 //! A robot installs a stub, and its own tools find the stub in place of the original.
 
 use anyhow::{Context, ensure};
+use ros::bus::RosVersion;
 use support::Verdict;
 use support::deployer::path_str;
 use support::machine::{Machine, free_port};
-use support::world::{PEOPLE, world};
+use support::world::{HERALD, PEOPLE, world};
 
 const SHELLS: [(&str, &str); 3] = [("sh", "setup.sh"), ("bash", "setup.bash"), ("zsh", "setup.zsh")];
 const OVERLAY: &str = "/opt/cloudroid";
@@ -226,6 +227,27 @@ pub fn where_the_other_ros_is_set_up_a_stub_is_refused() -> Verdict {
     let doctor = format!(". {OVERLAY}/setup.sh\nrosrun opencv_apps cloudroid-stub doctor");
     let good = machine.run_script("sh", &doctor)?.expect_success()?;
     ensure!(good.stdout.contains("ok    ros        ROS_VERSION is not set"), "{}", good.output());
+    Ok(())
+}
+
+pub fn where_nodes_speak_zenoh_a_stub_is_refused() -> Verdict {
+    let machine = Machine::with_stub_for(&*world().daemon_with(HERALD)?, "herald", RosVersion::Two)?;
+    let sourced = "export ROS_VERSION=2 ROS_DISTRO=kilted\n";
+    let zenoh = format!("{sourced}export RMW_IMPLEMENTATION=rmw_zenoh_cpp\n");
+    let said = ["RMW_IMPLEMENTATION is rmw_zenoh_cpp", "stubs speak DDS only", "RMW_IMPLEMENTATION=rmw_fastrtps_cpp"];
+    let install = "sh herald-stub/install.sh --robot zenoh";
+    let refused = machine.run_script("sh", &format!("{zenoh}{install}"))?.expect_failure(&said)?;
+    for words in ["FAIL  middleware", "nothing was installed"] {
+        ensure!(refused.output().contains(words), "{}", refused.output());
+    }
+    let written = machine.run_script("sh", &format!("ls -d {OVERLAY}"))?;
+    ensure!(written.status != 0, "{}", written.output());
+    let default = machine.run_script("sh", &format!("{sourced}{install}"))?.expect_success()?;
+    ensure!(default.stdout.contains("ok    middleware RMW_IMPLEMENTATION is not set"), "{}", default.output());
+    for program in ["cloudroid-stub doctor", "herald"] {
+        let script = format!("{zenoh}. {OVERLAY}/setup.sh\n{OVERLAY}/lib/herald/{program}");
+        machine.run_script("sh", &script)?.expect_failure(&said)?;
+    }
     Ok(())
 }
 

@@ -1,6 +1,8 @@
 //! Failures and what survives them: daemons, shims, inits and nodes are killed, and disks and databases fail.
 
-use std::path::Path;
+use std::collections::BTreeSet;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::SystemTime;
 
@@ -28,7 +30,7 @@ fn start_with_packages(name: &str, packages: &[(&str, &[&str])]) -> anyhow::Resu
 }
 
 /// Checks that nothing is left after its servants have been stopped.
-fn expect_nothing_left(daemon: Daemon) -> Verdict {
+pub(crate) fn expect_nothing_left(daemon: Daemon) -> Verdict {
     daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     let home = daemon.home.clone();
     daemon.stop()?;
@@ -134,6 +136,40 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
     let mut caller = second.robot("burglar_cpp?robot=r1")?;
     ensure!(try_attempt(&mut caller, "text-in-file", "/tmp/called yes")?.succeeded, "its scratch is as it was");
     expect_nothing_left(second)
+}
+
+/// Returns the directories of servants.
+fn servant_directories(daemon: &Daemon) -> BTreeSet<PathBuf> {
+    let entries = std::fs::read_dir(daemon.home.join("servants")).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).collect()
+}
+
+pub fn a_daemon_killed_while_a_servant_is_made_gives_it_all_that_it_is_granted() -> Verdict {
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let out = listener.local_addr()?;
+    let config = format!("keep_servants = true\n[servant]\nwarm_pool = 0\n[allow]\negress = [\"{out}\"]\n");
+    let setup = world().setup("relayed").config(&config);
+    let mut daemon = setup.start()?;
+    daemon.deployer().push(BURGLAR.0, &[BURGLAR.1, &["--egress", &out.to_string()]].concat())?.expect_success()?;
+    // Files of a servant in the order in which they come: its container and its relays are made after the first ones.
+    for (robot, file) in [("first", "spec.json"), ("second", "shim.log"), ("third", "runtime.json")] {
+        let (known, url) = (servant_directories(&daemon), daemon.url(&format!("burglar_cpp?robot={robot}")));
+        let asking = std::thread::spawn(move || drop(Robot::try_connect(&url)));
+        support::wait_until(&format!("{file} of a servant"), || {
+            let all = servant_directories(&daemon);
+            let is_made = all.difference(&known).any(|new| new.join(file).exists());
+            Ok(if is_made { Ok(()) } else { Err(format!("{all:?}")) })
+        })?;
+        daemon.kill()?;
+        ensure!(asking.join().is_ok(), "it panicked");
+        daemon = setup.start()?;
+        let mut robot = daemon.robot(&format!("burglar_cpp?robot={robot}"))?;
+        let way = format!("127.0.1.1:{}", out.port());
+        let attempt = try_attempt(&mut robot, "connect", &way)?;
+        ensure!(attempt.succeeded, "killed after {file}: no way out: {}", attempt.report);
+        listener.accept()?;
+    }
+    expect_nothing_left(daemon)
 }
 
 pub fn a_daemon_that_is_ended_says_why_and_keeps_its_servants() -> Verdict {

@@ -3,12 +3,13 @@
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, SystemTime};
 
 use anyhow::{Context, ensure};
 use support::Verdict;
 use support::deployer::{CommandOutcome, path_str, run};
 use support::world::{Directory, PREFIX, world};
-use support::{claim, leftovers};
+use support::{claim, evidence, leftovers};
 
 use crate::rehearsal;
 
@@ -74,6 +75,38 @@ pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
     let directories = std::fs::read_dir(kept.join("directories"))?.flatten();
     let notes = directories.filter(|directory| directory.path().join("note").exists());
     ensure!(notes.count() == 1, "its directory is kept");
+    Ok(())
+}
+
+pub fn evidence_is_cut_in_the_middle_and_the_oldest_goes_first() -> Verdict {
+    let place = world().directory("evidence")?;
+    let (from, to) = (place.path().join("long.log"), place.path().join("cut.log"));
+    let lines: String = (0..100_000).map(|number| format!("line {number}\n")).collect();
+    std::fs::write(&from, &lines)?;
+    evidence::copy_cut(&from, &to, 10_000)?;
+    let cut = std::fs::read_to_string(&to)?;
+    ensure!(cut.starts_with("line 0\n") && cut.ends_with("\nline 99999\n") && cut.len() < 10_100, "{cut}");
+    ensure!(cut.contains(&format!("\n[{} bytes are left out here]\n", lines.len() - 10_000)), "{cut}");
+    evidence::copy_cut(&from, &to, lines.len() as u64)?;
+    ensure!(std::fs::read_to_string(&to)? == lines, "what is short enough is kept as it is");
+    let omitted = place.path().join("omitted");
+    std::fs::write(&from, vec![0; 100_000])?;
+    ensure!(evidence::copy_cut(&from, &omitted, 10_000)? == 0 && !omitted.exists(), "a part of it is of no use");
+    // The size in all.
+    let root = place.path().join("stories");
+    let keep = |name: &str, age: u64| -> anyhow::Result<PathBuf> {
+        let kept = root.join(name);
+        std::fs::create_dir_all(kept.join("homes"))?;
+        std::fs::write(kept.join("homes/daemon.log"), vec![b'x'; 1000])?;
+        let reason = std::fs::File::create(kept.join("reason"))?;
+        reason.set_modified(SystemTime::now() - Duration::from_secs(age))?;
+        Ok(kept)
+    };
+    let (oldest, old, newest) = (keep("a/first", 300)?, keep("b/second", 200)?, keep("a/third", 100)?);
+    evidence::bound(&root, &newest, 2500);
+    ensure!(!oldest.exists() && old.exists() && newest.exists());
+    evidence::bound(&root, &newest, 10);
+    ensure!(!old.exists() && newest.exists(), "that of the story that failed last stays");
     Ok(())
 }
 

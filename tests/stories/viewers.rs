@@ -85,10 +85,10 @@ pub fn foxgloves_client_hears_and_an_operators_acts() -> Verdict {
 }
 
 /// Bytes that have arrived of an image which is not read further.
-const SOME: usize = 32 << 10;
+const PARTIAL_IMAGE: usize = 32 << 10;
 /// More images than are queued for a viewer: 2 of the topic, 16 of all its topics, 2 at its socket, and 4 MB in the
 /// kernel.
-const MANY: usize = 40;
+const UNREAD_IMAGES: usize = 40;
 
 fn request_pictures(viewer: &mut Robot) -> Verdict {
     let is_picture = |channel: &Value| channel["topic"] == "/sights/image/rgb8";
@@ -159,12 +159,12 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
     request_pictures(&mut slow)?;
     support::wait_until("a picture that it does not take", || {
         let bytes = slow.count_waiting_bytes()?;
-        Ok((bytes >= SOME).then_some(()).ok_or(format!("{bytes} bytes")))
+        Ok((bytes >= PARTIAL_IMAGE).then_some(()).ok_or(format!("{bytes} bytes")))
     })?;
     // Its queue is full once another viewer has received this many more.
     let mut quick = attach(&scene, &eve)?;
     request_pictures(&mut quick)?;
-    for _ in 0..MANY {
+    for _ in 0..UNREAD_IMAGES {
         wait_for_picture(&mut quick)?;
         let answer = scene.rover.call("/sights/ping", json!({}))?;
         ensure!(answer["values"]["message"] == "pong", "{answer}");

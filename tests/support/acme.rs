@@ -66,25 +66,26 @@ impl AcmeDirectory {
         let file = place.join("pebble.json");
         std::fs::write(&file, config.to_string())?;
         let names = free_port()?;
-        let quiet = |command: &mut Command| -> anyhow::Result<Child> {
+        // They end with the thread of the story, however that ends: the run's disk goes with its last process.
+        let start = |program: &str, arguments: &[&str]| -> anyhow::Result<Child> {
             let log = std::fs::File::options().create(true).append(true).open(place.join("log"))?;
-            let child = command.stdin(Stdio::null()).stdout(log.try_clone()?).stderr(log).spawn();
-            child.context("cannot start Pebble; the Debian package is pebble")
+            let child = Command::new("setpriv")
+                .args(["--pdeathsig", "KILL", program])
+                .args(arguments)
+                .env("PEBBLE_VA_NOSLEEP", "1")
+                .stdin(Stdio::null())
+                .stdout(log.try_clone()?)
+                .stderr(log)
+                .spawn();
+            child.context("cannot start setpriv of util-linux")
         };
         let mut authority = PebbleServer { directory: self.port, place: place.to_owned(), running: Vec::new() };
-        authority.running.push(quiet(
-            Command::new("pebble-challtestsrv")
-                .args(["-defaultIPv6", "", "-http01", "", "-https01", ""])
-                .args(["-tlsalpn01", "", "-dns01", &format!("127.0.0.1:{names}")])
-                .args(["-management", &format!("127.0.0.1:{}", free_port()?)]),
-        )?);
-        authority.running.push(quiet(
-            Command::new("pebble").env("PEBBLE_VA_NOSLEEP", "1").arg("-config").arg(&file).args([
-                "-strict",
-                "-dnsserver",
-                &format!("127.0.0.1:{names}"),
-            ]),
-        )?);
+        let (dns, control) = (format!("127.0.0.1:{names}"), format!("127.0.0.1:{}", free_port()?));
+        let off = ["-defaultIPv6", "", "-http01", "", "-https01", "", "-tlsalpn01", ""];
+        let resolver = [&off[..], &["-dns01", &dns, "-management", &control]].concat();
+        authority.running.push(start("pebble-challtestsrv", &resolver)?);
+        let config = file.to_str().context("a path in UTF-8")?;
+        authority.running.push(start("pebble", &["-config", config, "-strict", "-dnsserver", &dns])?);
         authority.wait_until_ready()?;
         let root = run(Command::new("curl")
             .args(["--silent", "--show-error", "--fail", "--cacert"])
@@ -105,11 +106,16 @@ impl PebbleServer {
             for child in &mut self.running {
                 if let Some(status) = child.try_wait()? {
                     let log = std::fs::read_to_string(self.place.join("log"))?;
-                    anyhow::bail!("Pebble ended with {status}:\n{log}");
+                    anyhow::bail!("Pebble (Debian package pebble) ended with {status}:\n{log}");
                 }
             }
             Ok(reached.map(drop).map_err(|error| error.to_string()))
         })
+    }
+
+    /// Returns its processes, which nobody ends any more.
+    pub fn into_processes(mut self) -> Vec<Child> {
+        std::mem::take(&mut self.running)
     }
 
     /// Returns the root certificate of the issued certificates.

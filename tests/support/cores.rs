@@ -10,7 +10,7 @@ use crate::story;
 /// Time after which work starts even if no core is free, because a story may have to end the work that occupies one.
 const LONGEST_WAIT: Duration = Duration::from_secs(90);
 
-static TAKEN: Mutex<usize> = Mutex::new(0);
+static CORES_TAKEN: Mutex<usize> = Mutex::new(0);
 static FREED: Condvar = Condvar::new();
 
 /// A permit to keep one core busy, until drop.
@@ -21,7 +21,7 @@ pub struct CorePermit(());
 pub fn acquire() -> CorePermit {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     let began = Instant::now();
-    let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
+    let taken = CORES_TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     let (mut taken, _) =
         FREED.wait_timeout_while(taken, LONGEST_WAIT, |taken| *taken >= cores).unwrap_or_else(PoisonError::into_inner);
     *taken += 1;
@@ -32,7 +32,7 @@ pub fn acquire() -> CorePermit {
 
 impl Drop for CorePermit {
     fn drop(&mut self) {
-        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        *CORES_TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
         FREED.notify_one();
     }
 }

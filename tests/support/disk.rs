@@ -19,13 +19,13 @@ use crate::deployer::{path_str, run};
 /// Prefix of the names of the files.
 const PREFIX: &str = "stories-disk-";
 /// Age after which a file with a name counts as a leftover.
-const FORGOTTEN: Duration = Duration::from_secs(600);
+const LEFTOVER_AGE: Duration = Duration::from_secs(600);
 /// Maximum size of the file in GiB; homes of a run take up to 12 GiB at a time.
 const SIZE: u64 = 32;
 /// Space to leave free on the underlying disk, in GiB.
 const RESERVE: u64 = 4;
 /// Minimum size for a run, in GiB.
-const LEAST: u64 = 8;
+const MIN_GIB: u64 = 8;
 
 /// Gives this process and its children a private mount namespace. Must be called before the process has threads.
 ///
@@ -46,7 +46,7 @@ pub fn mount_on(place: &Path, parent: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(parent)?;
     remove_forgotten(parent);
     let free = free_bytes(parent)? >> 30;
-    ensure!(free >= LEAST + RESERVE, "{} has {free} GB free, and {} are needed", parent.display(), LEAST + RESERVE);
+    ensure!(free >= MIN_GIB + RESERVE, "{} has {free} GB free, and {} are needed", parent.display(), MIN_GIB + RESERVE);
     let file = tempfile::Builder::new().prefix(PREFIX).tempfile_in(parent)?;
     file.as_file().set_len(SIZE.min(free - RESERVE) << 30)?;
     let path = path_str(file.path());
@@ -66,7 +66,7 @@ fn remove_forgotten(parent: &Path) {
     for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX)) {
         let made = entry.metadata().and_then(|about| about.modified());
         let age = made.ok().and_then(|made| made.elapsed().ok());
-        if age.is_some_and(|age| age > FORGOTTEN) {
+        if age.is_some_and(|age| age > LEFTOVER_AGE) {
             let _ = std::fs::remove_file(entry.path());
         }
     }

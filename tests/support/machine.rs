@@ -7,6 +7,7 @@ use std::process::Command;
 
 use anyhow::{Context, ensure};
 use nix::fcntl::{Flock, FlockArg};
+use ros::bus::RosVersion;
 
 use crate::binaries;
 use crate::daemon::Daemon;
@@ -37,7 +38,7 @@ const PACKAGES: [&str; 18] = [
     "avahi-daemon",
 ];
 /// Package with the launch files and package.xml; it is unpacked without its dependencies, which are of no use here.
-const UNPACKED: &str = "libopencv-apps-dev";
+const UNPACKED_PACKAGE: &str = "libopencv-apps-dev";
 const SUITE: &str = "bookworm";
 
 /// A robot's computer.
@@ -56,12 +57,18 @@ impl Machine {
         Ok(Machine { base: base()?, own })
     }
 
-    /// Creates a machine with a stub of `service` unpacked in `/root`, fetched as a robot would fetch it.
+    /// Creates a machine with a stub of `service` unpacked in `/root`, fetched as a robot of ROS 1 would fetch it.
     pub fn with_stub(daemon: &Daemon, service: &str) -> anyhow::Result<Machine> {
+        Self::with_stub_for(daemon, service, RosVersion::One)
+    }
+
+    /// Creates a machine with a stub of `service` for robots of this version, as [`Machine::with_stub`] does.
+    pub fn with_stub_for(daemon: &Daemon, service: &str, ros: RosVersion) -> anyhow::Result<Machine> {
         let machine = Machine::new()?;
         let place = world().directory("stub")?;
         let (address, directory) = (format!("http://{}", daemon.address), path_str(place.path()));
-        let words = ["--server", &address, "stub", service, "--ros", "1", "-o", directory];
+        let number = ros.number().to_string();
+        let words = ["--server", &address, "stub", service, "--ros", &number, "-o", directory];
         daemon.deployer().run(&words)?.expect_success()?;
         machine.unpack(&place.path().join(format!("{service}.tar.gz")))?;
         Ok(machine)
@@ -148,7 +155,7 @@ pub fn base() -> anyhow::Result<PathBuf> {
         .context("HOME says where caches are")?
         .join("cloudroid/robots");
     let mut hash = std::hash::DefaultHasher::new();
-    std::hash::Hash::hash(&(PACKAGES, UNPACKED, SUITE), &mut hash);
+    std::hash::Hash::hash(&(PACKAGES, UNPACKED_PACKAGE, SUITE), &mut hash);
     let name = format!("{SUITE}-{:016x}", std::hash::Hasher::finish(&hash));
     let base = cache.join(&name);
     std::fs::create_dir_all(&cache)?;
@@ -162,8 +169,8 @@ pub fn base() -> anyhow::Result<PathBuf> {
         std::fs::remove_dir_all(&half)?;
     }
     let unpack = format!(
-        "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED} && dpkg -x {UNPACKED}_*.deb / && rm \
-         {UNPACKED}_*.deb'"
+        "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED_PACKAGE} && dpkg -x {UNPACKED_PACKAGE}_*.deb / \
+         && rm {UNPACKED_PACKAGE}_*.deb'"
     );
     // Mounts of mmdebstrap are invisible to others, and disappear when it is killed.
     let made = run(Command::new("unshare")

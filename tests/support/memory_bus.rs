@@ -338,7 +338,7 @@ impl MemoryBus {
         Box::new(self.guard(move |state| state.clients.remove(&number)))
     }
 
-    fn served(&self, service: &str) -> Result<(ServiceType, Arc<dyn ServiceHandler>), BusError> {
+    fn find_served(&self, service: &str) -> Result<(ServiceType, Arc<dyn ServiceHandler>), BusError> {
         let state = self.system.state.lock();
         let found = state.services.get(service);
         found
@@ -460,7 +460,7 @@ impl Bus for MemoryBus {
         request: Bytes,
         patience: Duration,
     ) -> Result<Bytes, BusError> {
-        let (of, handler) = self.served(service)?;
+        let (of, handler) = self.find_served(service)?;
         if !of.digest.is_compatible_with(digest) {
             return Err(BusError::TypeMismatch {
                 what: format!("service {service}"),
@@ -479,7 +479,7 @@ impl Bus for MemoryBus {
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
-        Ok(self.served(service)?.0)
+        Ok(self.find_served(service)?.0)
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
@@ -609,7 +609,7 @@ impl ActionClient for MemoryClient {
                 text: reason.into_string(),
                 result: Bytes::new(),
             }));
-        } else {
+        } else if !server.is_answer_deferred() {
             events.on_accepted();
         }
     }
@@ -653,14 +653,30 @@ struct MemoryServer {
     number: u128,
 }
 
+impl MemoryServer {
+    /// Returns the events of a goal that has not ended.
+    fn goal_events(&self, id: &str) -> Option<Arc<dyn GoalEvents>> {
+        let state = self.system.state.lock();
+        let action = state.actions.get(&self.action);
+        action.and_then(|action| action.goals.get(id).map(|(_, events)| events.clone()))
+    }
+}
+
 impl ActionServer for MemoryServer {
+    fn accept_goal(&self, id: &str) {
+        if let Some(events) = self.goal_events(id) {
+            events.on_waiting();
+        }
+    }
+
+    fn execute_goal(&self, id: &str) {
+        if let Some(events) = self.goal_events(id) {
+            events.on_accepted();
+        }
+    }
+
     fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
-        let events = {
-            let state = self.system.state.lock();
-            let action = state.actions.get(&self.action);
-            action.and_then(|action| action.goals.get(id).map(|(_, events)| events.clone()))
-        };
-        match events {
+        match self.goal_events(id) {
             Some(events) => {
                 events.on_feedback(feedback);
                 true

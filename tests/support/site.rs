@@ -402,7 +402,8 @@ impl Site {
         let mut command = Command::new("unshare");
         command.args(["--mount", "sh", "-c", script, "sh", program]).args(argv);
         command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
-        self.start(command, &self.place.path().join("original.log"))
+        let name = program.rsplit('/').next().unwrap_or(program);
+        self.start(command, &self.place.path().join(format!("{name}-in-image.log")))
     }
 
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<NodeProcess> {

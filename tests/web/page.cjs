@@ -252,6 +252,10 @@ const STEPS = {
     assert.strictEqual((await visitor.page.$$('form details[open]')).length, 0);
     assert.strictEqual((await visitor.page.$$eval('form input:not([type]), form textarea', (all) => all.filter((one) => one.checkVisibility()).length)), 3);
     await visitor.judges('deploy-empty');
+    // What there is to build upon is asked for when it is unfolded.
+    await visitor.page.locator('summary ::-p-text(Bases and underlays)').click();
+    for (const words of ['bookworm-ros1', 'debian bookworm']) await visitor.sees(words);
+    await visitor.judges('deploy-bases');
     await visitor.clicks('Push');
     await visitor.sees('no package is chosen');
     const folder = await visitor.page.waitForSelector('input[webkitdirectory]');
@@ -284,8 +288,13 @@ const STEPS = {
     await fast();
     rmSync(large, { recursive: true });
     rmSync(`${large}.tar.gz`);
-    // The folder is dropped, and the push of it cancelled while it is looked at.
-    await visitor.drops('.drop', [resolve(sources)]);
+    // The folder is dropped, and the push of it cancelled while it is looked at. What it ignores is decided at once, however many
+    // ways to match a pattern has.
+    const ignoring = join(pictures, 'ignoring');
+    cpSync(sources, join(ignoring, 'adder_py'), { recursive: true });
+    writeFileSync(join(ignoring, 'adder_py', '.cloudroidignore'), `${'**/'.repeat(30)}${'*a'.repeat(30)}*b\n`);
+    writeFileSync(join(ignoring, 'adder_py', 'a'.repeat(200)), '');
+    await visitor.drops('.drop', [resolve(ignoring, 'adder_py')]);
     await visitor.sees('Chosen: the folder adder_py');
     await visitor.clicks('Push');
     await visitor.sees('starting it once');
@@ -293,9 +302,12 @@ const STEPS = {
     await visitor.sees(cancelled);
     assert.strictEqual(await visitor.page.$('.trouble'), null);
     assert.deepStrictEqual(await published(), []);
+    await visitor.drops('.drop', [resolve(sources)]);
+    await visitor.sees('Chosen: the folder adder_py');
     await visitor.tabsTo('Push');
     await visitor.page.keyboard.press('Enter');
     await visitor.sees('Published: adder_py, revision 1');
+    rmSync(ignoring, { recursive: true });
     await visitor.sees('Interface found');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
     // The earlier ones are listed, and what they printed can be read.
@@ -471,7 +483,8 @@ const STEPS = {
 
     // By the keyboard alone: the first stop of the tabulator skips what is on every page.
     await visitor.page.reload();
-    await visitor.page.waitForSelector('nav');
+    // The heading, to which it leads, comes after the navigation.
+    await visitor.page.waitForSelector('main h1');
     await visitor.page.keyboard.press('Tab');
     await visitor.page.keyboard.press('Enter');
     assert.strictEqual(await visitor.page.evaluate(() => document.activeElement.tagName), 'H1');
@@ -1253,6 +1266,8 @@ async function main() {
     executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
     // Of the daemon's own certificate nobody has told the browser.
     acceptInsecureCerts: true,
+    // On a busy machine the browser may be minutes late; each step has a limit of its own.
+    protocolTimeout: 0,
     args: ['--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--disable-background-networking', '--disable-component-update'],
   });
   try {

@@ -1,5 +1,4 @@
-//! Time that the resource controller needs per decision for a thousand servants, compared with a single pass over the
-//! same facts.
+//! Time that the controller needs per decision for a thousand servants, beside a single pass over the same facts.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -41,17 +40,13 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let times = race.run();
     let milliseconds = |index: usize| times[index].best_micros() / 1000.0;
     for (index, what) in ["nearly all change", "few change"].into_iter().enumerate() {
-        let title = format!("decide on {SERVANTS} servants, {what}");
-        report
-            .figure(title, "ms", milliseconds(index))
-            .relative_to("one pass over the facts", milliseconds(2))
-            .require(Target::AtMost(1.0));
+        let figure = report.figure(format!("decide on {SERVANTS} servants, {what}"), "ms", milliseconds(index));
+        figure.relative_to("one pass over the facts", milliseconds(2)).require(Target::AtMost(1.0));
     }
     Ok(())
 }
 
-/// Facts of one servant. Of every three servants, one is promised cores, one has robots that state response times, and
-/// one is best effort.
+/// Facts of one servant. Of three servants, one is promised cores, one has response times, one is best effort.
 fn servant_facts(id: &str, number: u64) -> ControlFacts<'_> {
     let promised = if number % 3 == 2 { 0 } else { 100 + number % 200 };
     let limit = if promised == 0 { CORES } else { promised };

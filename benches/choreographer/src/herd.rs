@@ -1,5 +1,4 @@
-//! Fifty robots that connect at once to a machine with room for four: the time until each learns its place in the
-//! queue, and whether all are served.
+//! Fifty robots connect at once to a machine with room for four: when each knows its place, and whether all are served.
 
 use std::collections::HashMap;
 use std::sync::Barrier;
@@ -32,15 +31,8 @@ struct QueueSample {
 
 pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let daemon = BenchDaemon::start(CONFIG)?;
-    daemon.push(&[
-        deployer::path_str(&binaries::package("adder_py")),
-        "--name",
-        "worker",
-        "--node",
-        "adder.py",
-        "--cpus",
-        "1",
-    ])?;
+    let worker = ["--name", "worker", "--node", "adder.py", "--cpus", "1"];
+    daemon.push(&[&[deployer::path_str(&binaries::package("adder_py"))], &worker[..]].concat())?;
     let floor = run_concurrently(|_| {
         let asked = Instant::now();
         daemon.get("/healthz")?;
@@ -52,11 +44,10 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let twice = went.iter().filter(|one| one.answers > 1).count() + count_duplicate_starts(&daemon)?;
     let waited = went.iter().filter(|one| one.waited).count();
     let title = format!("{ROBOTS} robots before {PLACES} places: the last knows where it stands");
-    report
-        .figure(title, "s", told(&went).as_secs_f64())
-        .relative_to("the last of as many HTTP answers", floor.iter().max().copied().unwrap_or_default().as_secs_f64())
-        .require(Target::AtMost(1.0))
-        .note(format!("{waited} were told their number in the queue, the others were served at once"));
+    let answered = floor.iter().max().copied().unwrap_or_default().as_secs_f64();
+    let figure = report.figure(title, "s", told(&went).as_secs_f64()).require(Target::AtMost(1.0));
+    figure.relative_to("the last of as many HTTP answers", answered);
+    figure.note(format!("{waited} were told their number in the queue, the others were served at once"));
     report.figure("of them lost", "robots", lost as f64).require(Target::AtMost(0.0));
     report.figure("served twice", "robots", twice as f64).require(Target::AtMost(0.0));
     Ok(())
@@ -88,16 +79,12 @@ fn run_robot(daemon: &Daemon, number: usize) -> Result<QueueSample> {
     let mut went = QueueSample { told: Duration::MAX, waited: false, answers: 0 };
     loop {
         let patience = if went.answers == 0 { PATIENCE } else { AGAIN };
-        let Ok(frame) = robot.next_frame_within(patience) else {
-            break;
+        let Ok(frame) = robot.next_frame_within(patience) else { break };
+        let said: Value = match frame {
+            Message::Text(text) => serde_json::from_str(text.as_str())?,
+            Message::Close(_) => break,
+            _ => continue,
         };
-        let Message::Text(text) = frame else {
-            if frame.is_close() {
-                break;
-            }
-            continue;
-        };
-        let said: Value = serde_json::from_str(text.as_str())?;
         let number =
             said["op"] == "status" && said["msg"].as_str().is_some_and(|words| words.contains("this robot is number"));
         let answer = said["op"] == "service_response" && said["id"] == "it";

@@ -1,7 +1,5 @@
-//! Servants that robots share: calls per second of fifty robots, compared with one robot that has a servant of its own,
-//! and with a roscpp client of the same node in the same container. Each call waits for two milliseconds, like a node
-//! whose work is done elsewhere (by a graphics card or a device), so that servants are the shared resource and not this
-//! machine's cores.
+//! Calls per second of fifty robots that share servants, beside one robot with a servant of its own and a roscpp client
+//! in the same container. Each call waits for two milliseconds, so that servants are shared and not cores.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -35,21 +33,15 @@ pub fn measure(report: &mut BenchReport) -> Result<()> {
     }
     let roscpp = roscpp_call_rate(&daemon)?;
     let single = measure_call_rate(&daemon, "own", 1)?;
-    report
-        .figure("one robot at a servant of its own", "calls/s", single)
-        .relative_to("roscpp in the same container", roscpp);
+    let figure = report.figure("one robot at a servant of its own", "calls/s", single);
+    figure.relative_to("roscpp in the same container", roscpp);
     for (name, servants) in [("one", 1), ("two", 2)] {
         let shared = measure_call_rate(&daemon, name, ROBOTS)?;
         let sum = single * f64::from(servants);
-        let title = format!("{ROBOTS} robots at {servants} shared");
-        report
-            .figure(title, "calls/s", shared)
-            .relative_to(format!("{servants} x one robot at its own"), sum)
-            .require(Target::RatioAtLeast(0.9));
-        let title = format!("{ROBOTS} robots at {servants} shared");
-        report
-            .figure(title, "calls/s", shared)
-            .relative_to(format!("{servants} x roscpp in the same container"), roscpp * f64::from(servants));
+        let figure = report.figure(format!("{ROBOTS} robots at {servants} shared"), "calls/s", shared);
+        figure.relative_to(format!("{servants} x one robot at its own"), sum).require(Target::RatioAtLeast(0.9));
+        let figure = report.figure(format!("{ROBOTS} robots at {servants} shared"), "calls/s", shared);
+        figure.relative_to(format!("{servants} x roscpp in the same container"), roscpp * f64::from(servants));
     }
     Ok(())
 }

@@ -1,7 +1,5 @@
-//! Messages as columns of numbers, for general-purpose codecs that know neither ROS nor pictures.
-//!
-//! A message is taken apart into its big arrays, each of which is one column per field or channel, and the few bytes
-//! around them. This gives peers of the link's codecs the same knowledge of the message's layout.
+//! Messages as columns of numbers: one per field or channel of their big arrays, and the few bytes around them. This
+//! gives general-purpose codecs the same knowledge of the layout as the link's codecs have.
 
 use anyhow::{Context, Result, ensure};
 use codec::Schema;
@@ -51,7 +49,7 @@ pub struct ColumnLayout {
 impl ColumnLayout {
     /// Reads the layout of a message in the format of ROS 1, which the messages of this benchmark have.
     pub fn read(schema: Schema, message: &[u8]) -> Result<Self> {
-        let mut input = Fields { message, at: 12 };
+        let mut input = Fields { bytes: message, at: 12 };
         input.text()?;
         let mut layout = Self::default();
         match schema {
@@ -109,7 +107,7 @@ impl ColumnLayout {
         for _ in 0..fields {
             let name = input.text()?;
             let offset = input.size()?;
-            let is_float = input.message.get(input.at) == Some(&7);
+            let is_float = input.bytes.get(input.at) == Some(&7);
             input.at += 1;
             input.size()?;
             match name {
@@ -159,22 +157,27 @@ impl ColumnLayout {
     }
 }
 
-/// Reads the fields of a message in the format of ROS 1.
-struct Fields<'a> {
-    message: &'a [u8],
-    at: usize,
+/// Reads little-endian fields one after the other.
+pub struct Fields<'a> {
+    pub bytes: &'a [u8],
+    /// Offset of the next field.
+    pub at: usize,
 }
 
 impl<'a> Fields<'a> {
-    fn size(&mut self) -> Result<usize> {
-        let bytes = self.message.get(self.at..self.at + 4).context("a message ends within a number")?;
-        self.at += 4;
-        Ok(u32::from_le_bytes(bytes.try_into()?) as usize)
+    pub fn take(&mut self, count: usize) -> Result<&'a [u8]> {
+        let taken = self.bytes.get(self.at..self.at + count).context("it ends within a field")?;
+        self.at += count;
+        Ok(taken)
     }
 
-    fn text(&mut self) -> Result<&'a [u8]> {
+    pub fn size(&mut self) -> Result<usize> {
+        Ok(u32::from_le_bytes(self.take(4)?.try_into()?) as usize)
+    }
+
+    /// Reads bytes behind their number.
+    pub fn text(&mut self) -> Result<&'a [u8]> {
         let length = self.size()?;
-        self.at += length;
-        self.message.get(self.at - length..self.at).context("a message ends within a text")
+        self.take(length)
     }
 }

@@ -1,8 +1,5 @@
-//! `make bench ONLY=codecs`: the link's codecs compared with zlib, zstd, PNG, JPEG, x264 and memcpy, in turns, on one
-//! core.
-//!
-//! The arguments name the parts to run (colour, depth, grid, scan, cloud, video, corners, published); without arguments
-//! all parts run.
+//! `make bench ONLY=codecs`: the link's codecs compared with zlib, zstd, pco, PNG, JPEG, x264 and memcpy, in turns, on
+//! one core. Arguments name the parts to run.
 
 mod cloud;
 mod columns;

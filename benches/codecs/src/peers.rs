@@ -1,17 +1,16 @@
-//! General-purpose codecs for columns of numbers: pco, and filters in front of zstd.
-//!
-//! Frame: what the link's frames have as well (four bytes in front, the message's length, its CRC-32), then the bytes
-//! around the columns, then the columns. The decoder reads the layout from the message itself, as the link's does from
-//! the head; here it is given, which costs the peers nothing.
+//! General-purpose codecs for columns of numbers: pco, and filters in front of zstd. A frame has what the link's frames
+//! have as well (four bytes, the length, a CRC-32), the bytes around the columns, and the columns. Decoders are given
+//! the layout, which costs the peers nothing.
 
 use crate::columns::{Column, ColumnLayout};
 use anyhow::{Context, Result, ensure};
 use pco::ChunkConfig;
 use pco::data_types::Number;
 use pco::wrapped::{FileCompressor, FileDecompressor};
+use std::num::Wrapping;
+use std::ops::{Add, BitAnd, BitXor, Shl, Shr, Sub};
 
-/// A way to make the bytes of a column cheaper for zstd; each is followed by a shuffle of its bytes (all lowest ones,
-/// then all second ones …).
+/// A way to make a column cheaper for zstd; a shuffle of its bytes (all lowest ones, then all second ones …) follows.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Filter {
     /// No other.
@@ -80,7 +79,7 @@ impl Peer {
                 let config = config.with_paging_spec(pco::PagingSpec::EqualPagesUpTo(1 << 24));
                 let file = FileCompressor::default();
                 out = file.write_header(out)?;
-                for column in &layout.columns {
+                for column in layout.columns.iter().filter(|column| column.count > 0) {
                     out = put_pco_column(&file, column, &column.read(message), &config, out)?;
                 }
             }
@@ -114,7 +113,7 @@ impl Peer {
             Self::Pco(_) => {
                 let (file, after) = FileDecompressor::new(rest)?;
                 rest = after;
-                for column in &layout.columns {
+                for column in layout.columns.iter().filter(|column| column.count > 0) {
                     let (numbers, after) = take_pco_column(&file, column, rest)?;
                     column.write(&numbers, &mut message);
                     rest = after;
@@ -140,6 +139,7 @@ fn checksum(message: &[u8]) -> u32 {
     crc.sum()
 }
 
+/// Appends a column, which is not empty.
 fn put_pco_column(
     file: &FileCompressor,
     column: &Column,
@@ -147,9 +147,6 @@ fn put_pco_column(
     config: &ChunkConfig,
     out: Vec<u8>,
 ) -> Result<Vec<u8>> {
-    if column.count == 0 {
-        return Ok(out);
-    }
     match (column.bytes, column.is_float) {
         (1, _) => put_pco(file, numbers, config, out),
         (2, _) => put_pco(file, &shorts(numbers), config, out),
@@ -167,37 +164,28 @@ fn put_pco<T: Number>(file: &FileCompressor, numbers: &[T], config: &ChunkConfig
     Ok(chunk.write_page(0, out)?)
 }
 
+/// The inverse: returns the column and the bytes behind it.
 fn take_pco_column<'a>(file: &FileDecompressor, column: &Column, input: &'a [u8]) -> Result<(Vec<u8>, &'a [u8])> {
-    if column.count == 0 {
-        return Ok((Vec::new(), input));
+    let count = column.count;
+    match (column.bytes, column.is_float) {
+        (1, _) => take_pco(file, count, input, u8::to_le_bytes),
+        (2, _) => take_pco(file, count, input, u16::to_le_bytes),
+        (_, false) => take_pco(file, count, input, u32::to_le_bytes),
+        (_, true) => take_pco(file, count, input, f32::to_le_bytes),
     }
-    Ok(match (column.bytes, column.is_float) {
-        (1, _) => take_pco::<u8>(file, column.count, input)?,
-        (2, _) => {
-            let (numbers, rest) = take_pco::<u16>(file, column.count, input)?;
-            (numbers.into_iter().flat_map(u16::to_le_bytes).collect(), rest)
-        }
-        (_, false) => {
-            let (numbers, rest) = take_pco::<u32>(file, column.count, input)?;
-            (numbers.into_iter().flat_map(u32::to_le_bytes).collect(), rest)
-        }
-        (_, true) => {
-            let (numbers, rest) = take_pco::<f32>(file, column.count, input)?;
-            (numbers.into_iter().flat_map(f32::to_le_bytes).collect(), rest)
-        }
-    })
 }
 
-fn take_pco<'a, T: Number + Default>(
+fn take_pco<'a, T: Number + Default, const BYTES: usize>(
     file: &FileDecompressor,
     count: usize,
     input: &'a [u8],
-) -> Result<(Vec<T>, &'a [u8])> {
+    to_bytes: fn(T) -> [u8; BYTES],
+) -> Result<(Vec<u8>, &'a [u8])> {
     let (mut chunk, rest) = file.chunk_decompressor::<T, _>(input)?;
     let mut numbers = vec![T::default(); count];
     let mut page = chunk.page_decompressor(rest, count)?;
     page.read(&mut numbers)?;
-    Ok((numbers, page.into_src()))
+    Ok((numbers.into_iter().flat_map(to_bytes).collect(), page.into_src()))
 }
 
 fn shorts(numbers: &[u8]) -> Vec<u16> {
@@ -208,61 +196,60 @@ fn words(numbers: &[u8]) -> Vec<u32> {
     numbers.chunks_exact(4).map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect()
 }
 
-/// An unsigned number of a column.
-trait Unsigned: Copy + Default {
+/// An unsigned number of a column, whose arithmetic wraps around.
+trait Unsigned: Copy + Default + Add<Output = Self> + Sub<Output = Self> + Bits {
     const BYTES: usize;
-    fn read(bytes: &[u8]) -> Vec<Self>;
-    fn byte(self, index: usize) -> u8;
-    fn from_planes(planes: &[u8], count: usize, index: usize) -> Self;
-    fn plus(self, other: Self) -> Self;
-    fn minus(self, other: Self) -> Self;
-    fn xor(self, other: Self) -> Self;
-    fn zigzag(self) -> Self;
-    fn unzigzag(self) -> Self;
+    fn from_byte(byte: u8) -> Self;
+    fn low_byte(self) -> u8;
+
+    #[inline(always)]
+    fn byte(self, index: usize) -> u8 {
+        (self >> (8 * index)).low_byte()
+    }
+
+    /// Returns the number with these bytes, the lowest first.
+    #[inline(always)]
+    fn join(bytes: impl DoubleEndedIterator<Item = u8>) -> Self {
+        bytes.rev().fold(Self::default(), |number, byte| (number << 8) ^ Self::from_byte(byte))
+    }
+
+    #[inline(always)]
+    fn zigzag(self) -> Self {
+        (self << 1) ^ (Self::default() - (self >> (Self::BYTES * 8 - 1)))
+    }
+
+    #[inline(always)]
+    fn unzigzag(self) -> Self {
+        (self >> 1) ^ (Self::default() - (self & Self::from_byte(1)))
+    }
+}
+
+trait Bits:
+    Sized + BitAnd<Output = Self> + BitXor<Output = Self> + Shl<usize, Output = Self> + Shr<usize, Output = Self>
+{
 }
 
 macro_rules! unsigned {
-    ($type:ty, $signed:ty, $read:expr) => {
-        impl Unsigned for $type {
+    ($($type:ty),*) => { $(
+        impl Bits for Wrapping<$type> {}
+
+        impl Unsigned for Wrapping<$type> {
             const BYTES: usize = size_of::<$type>();
-            fn read(bytes: &[u8]) -> Vec<Self> {
-                $read(bytes)
-            }
+
             #[inline(always)]
-            fn byte(self, index: usize) -> u8 {
-                (self >> (8 * index)) as u8
+            fn from_byte(byte: u8) -> Self {
+                Self(byte.into())
             }
+
             #[inline(always)]
-            fn from_planes(planes: &[u8], count: usize, index: usize) -> Self {
-                (0..Self::BYTES).map(|byte| <$type>::from(planes[byte * count + index]) << (8 * byte)).sum()
-            }
-            #[inline(always)]
-            fn plus(self, other: Self) -> Self {
-                self.wrapping_add(other)
-            }
-            #[inline(always)]
-            fn minus(self, other: Self) -> Self {
-                self.wrapping_sub(other)
-            }
-            #[inline(always)]
-            fn xor(self, other: Self) -> Self {
-                self ^ other
-            }
-            #[inline(always)]
-            fn zigzag(self) -> Self {
-                (self << 1) ^ (self as $signed >> (<$type>::BITS - 1)) as $type
-            }
-            #[inline(always)]
-            fn unzigzag(self) -> Self {
-                (self >> 1) ^ (self & 1).wrapping_neg()
+            fn low_byte(self) -> u8 {
+                self.0 as u8
             }
         }
-    };
+    )* };
 }
 
-unsigned!(u8, i8, |bytes: &[u8]| bytes.to_vec());
-unsigned!(u16, i16, shorts);
-unsigned!(u32, i32, words);
+unsigned!(u8, u16, u32);
 
 impl Filter {
     /// Appends the filtered numbers of a column.
@@ -276,12 +263,12 @@ impl Filter {
             }
         }
         match column.bytes {
-            1 => self.apply_to::<u8>(&numbers, column.row, out),
-            2 => self.apply_to::<u16>(&numbers, column.row, out),
-            _ => self.apply_to::<u32>(&numbers, column.row, out),
+            1 => self.apply_to::<Wrapping<u8>>(&numbers, column.row, out),
+            2 => self.apply_to::<Wrapping<u16>>(&numbers, column.row, out),
+            _ => self.apply_to::<Wrapping<u32>>(&numbers, column.row, out),
         }
         out.extend_from_slice(&gaps);
-        Self::Shuffle.apply_to::<u32>(&apart, 0, out);
+        Self::Shuffle.apply_to::<Wrapping<u32>>(&apart, 0, out);
     }
 
     /// The inverse of [`Filter::apply`]: takes the column from the front of `input`.
@@ -294,19 +281,19 @@ impl Filter {
         let (planes, rest) = input.split_at(column.count * column.bytes);
         *input = rest;
         let numbers = match column.bytes {
-            1 => self.undo_of::<u8>(planes, column.row),
-            2 => self.undo_of::<u16>(planes, column.row),
-            _ => self.undo_of::<u32>(planes, column.row),
+            1 => self.undo_of::<Wrapping<u8>>(planes, column.row),
+            2 => self.undo_of::<Wrapping<u16>>(planes, column.row),
+            _ => self.undo_of::<Wrapping<u32>>(planes, column.row),
         };
         let Some(scale) = scale else { return Ok(numbers) };
         let (gaps, rest) = input.split_at(column.count);
         let (apart, rest) = rest.split_at(gaps.iter().filter(|&&gap| gap != 0).count() * 4);
         *input = rest;
-        Ok(scale.values(&numbers, gaps, &words(&Self::Shuffle.undo_of::<u32>(apart, 0))))
+        Ok(scale.values(&numbers, gaps, &words(&Self::Shuffle.undo_of::<Wrapping<u32>>(apart, 0))))
     }
 
     fn apply_to<T: Unsigned>(self, numbers: &[u8], row: usize, out: &mut Vec<u8>) {
-        let numbers = T::read(numbers);
+        let numbers: Vec<T> = numbers.chunks_exact(T::BYTES).map(|bytes| T::join(bytes.iter().copied())).collect();
         let zero = T::default();
         let mut filtered = Vec::with_capacity(numbers.len());
         match self {
@@ -317,7 +304,7 @@ impl Filter {
                 for (line, above) in numbers.chunks(row).zip(above) {
                     let (mut west, mut corner) = (zero, zero);
                     for (&number, &north) in line.iter().zip(above) {
-                        filtered.push(number.minus(west.plus(north).minus(corner)).zigzag());
+                        filtered.push((number - (west + north - corner)).zigzag());
                         (west, corner) = (number, north);
                     }
                 }
@@ -325,8 +312,8 @@ impl Filter {
             _ => {
                 let pairs = numbers.iter().zip(std::iter::once(&zero).chain(&numbers));
                 match self {
-                    Self::Xor => filtered.extend(pairs.map(|(&number, &last)| number.xor(last))),
-                    _ => filtered.extend(pairs.map(|(&number, &last)| number.minus(last).zigzag())),
+                    Self::Xor => filtered.extend(pairs.map(|(&number, &last)| number ^ last)),
+                    _ => filtered.extend(pairs.map(|(&number, &last)| (number - last).zigzag())),
                 }
             }
         }
@@ -337,12 +324,13 @@ impl Filter {
 
     fn undo_of<T: Unsigned>(self, planes: &[u8], row: usize) -> Vec<u8> {
         let count = planes.len() / T::BYTES;
-        let mut numbers: Vec<T> = (0..count).map(|index| T::from_planes(planes, count, index)).collect();
+        let mut numbers: Vec<T> =
+            (0..count).map(|index| T::join((0..T::BYTES).map(|byte| planes[byte * count + index]))).collect();
         let mut last = T::default();
         match self {
             Self::Shuffle => {}
             Self::Xor => numbers.iter_mut().for_each(|number| {
-                last = number.xor(last);
+                last = *number ^ last;
                 *number = last;
             }),
             Self::Plane | Self::Scaled if row > 0 => {
@@ -350,14 +338,14 @@ impl Filter {
                 for line in numbers.chunks_mut(row) {
                     let (mut west, mut corner) = (T::default(), T::default());
                     for (number, north) in line.iter_mut().zip(&mut above) {
-                        *number = number.unzigzag().plus(west.plus(*north).minus(corner));
+                        *number = number.unzigzag() + west + *north - corner;
                         (west, corner) = (*number, *north);
                         *north = *number;
                     }
                 }
             }
             Self::Delta | Self::Plane | Self::Scaled => numbers.iter_mut().for_each(|number| {
-                last = number.unzigzag().plus(last);
+                last = number.unzigzag() + last;
                 *number = last;
             }),
         }

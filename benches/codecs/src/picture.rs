@@ -1,6 +1,6 @@
 //! Images: colour, grey, Bayer, depth.
 
-use crate::contest::{CodecComparison, find_result, print_results, report_columns};
+use crate::contest::{Comparison, compare};
 use crate::messages::image;
 use crate::recorded;
 use crate::samples::{self, Noise, Picture};
@@ -9,33 +9,19 @@ use bench_report::{BenchReport, Race, Target};
 use codec::{Codec, Decoder, Encoder, Schema};
 use std::hint::black_box;
 
-const ROUNDS: usize = 9;
-
-fn image_comparison(messages: &[Vec<u8>]) -> CodecComparison<'_> {
-    CodecComparison { schema: Schema::Image, messages, rounds: ROUNDS }
-}
-
 /// Serializes images, with what `data` makes of each.
 fn images(encoding: &str, pictures: &[Picture], data: impl Fn(&Picture) -> Vec<u8>) -> Vec<Vec<u8>> {
-    let one = |p: &Picture| image(encoding, p.width, p.height, &data(p));
-    pictures.iter().map(one).collect()
+    pictures.iter().map(|p| image(encoding, p.width, p.height, &data(p))).collect()
 }
 
-/// Reports the four figures of a lossless image codec.
-fn report_lossless(report: &mut BenchReport, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<f64> {
-    let outcomes = image_comparison(messages).run(&[Codec::Image], &[1, 3, 19])?;
-    print_results(title, &outcomes);
-    report_columns(report, title, &outcomes, "image")?;
-    let (ours, zstd, best) =
-        (find_result(&outcomes, "image")?, find_result(&outcomes, "zstd 1")?, find_result(&outcomes, "zstd 19")?);
-    let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
-    figure.relative_to("zstd 19", best.saved).require(saved.map_or(Target::AboveFloor, Target::AtLeast));
-    let figure = report.figure(format!("{title}: encoding"), "MB/s", ours.encode).relative_to("zstd 1", zstd.encode);
-    if saved.is_some() {
-        figure.require(Target::RatioAtLeast(0.4));
-    }
-    report.figure(format!("{title}: decoding"), "MB/s", ours.decode).relative_to("zstd 1", zstd.decode);
-    Ok(ours.encode)
+/// Reports the figures of a lossless image codec; some pictures have a target of their own, in percent saved.
+fn report_lossless(report: &mut BenchReport, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<()> {
+    let comparisons = [
+        Comparison::Saved("zstd 19", saved.map_or(Target::AboveFloor, Target::AtLeast)),
+        Comparison::Encoding("zstd 1", saved.map(|_| Target::RatioAtLeast(0.4))),
+        Comparison::Decoding("zstd 1"),
+    ];
+    compare(report, title, Schema::Image, messages, &comparisons)
 }
 
 /// Encodes one image as PNG, as `image_transport`'s `compressed` does.
@@ -70,8 +56,7 @@ pub fn measure_colour(report: &mut BenchReport) -> Result<()> {
     let grey = |p: &Picture| -> Vec<u8> { p.data.chunks_exact(3).map(|pixel| pixel[1]).collect() };
     report_lossless(report, "grey", &images("mono8", &pictures, grey), None)?;
     let bayer = images("bayer_rggb8", &pictures, to_bayer);
-    report_lossless(report, "Bayer", &bayer, None)?;
-    Ok(())
+    report_lossless(report, "Bayer", &bayer, None)
 }
 
 /// Samples an image as a camera with a Bayer colour filter array would.
@@ -107,8 +92,6 @@ fn measure_peers(report: &mut BenchReport, pictures: &[Picture], messages: &[Vec
     race.add("JPEG 95", || pictures.iter().for_each(|picture| drop(black_box(jpeg(picture)))));
     let times = race.run();
     let speed: Vec<f64> = times.iter().map(|times| times.megabytes_per_second(bytes)).collect();
-    println!("    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s", speed[1]);
-    println!("    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy", speed[2]);
     let figure = report.figure("colour: encoding", "MB/s", speed[0]).relative_to("PNG", speed[1]);
     figure.require(Target::RatioAtLeast(5.0)).note(format!("PNG saves {png_saved:.1}%"));
     let figure = report.figure("colour: encoding", "MB/s", speed[0]).relative_to("JPEG 95", speed[2]);
@@ -117,25 +100,24 @@ fn measure_peers(report: &mut BenchReport, pictures: &[Picture], messages: &[Vec
 }
 
 pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
-    let pictures = samples::depth_frames()?;
-    ensure!(!pictures.is_empty(), "no depth image at hand: neither recordings nor scikit-image's samples");
+    let kinect = recorded::is_installed("recorded depth", report).then(recorded::kinect_frame).transpose()?;
+    let kinect = kinect.map(|(_, depth)| depth);
+    let mut pictures = samples::depth_frames()?;
+    if pictures.is_empty() {
+        pictures.extend(kinect.clone());
+    }
+    ensure!(!pictures.is_empty(), "no depth image at hand: neither recordings nor mrpt-common");
     let whole = images("16UC1", &pictures, |picture| picture.data.clone());
     report_lossless(report, "depth", &whole, Some(83.0))?;
     let holes = images("16UC1", &pictures, with_holes);
     report_lossless(report, "depth with holes", &holes, None)?;
     let metres = images("32FC1", &pictures, |picture| to_metres(&with_holes(picture)));
     report_lossless(report, "float depth", &metres, None)?;
-    if recorded::is_installed("recorded depth", report) {
-        let depth = recorded::kinect_frame()?.1;
+    if let Some(depth) = kinect {
         let millimetres = image("16UC1", depth.width, depth.height, &depth.data);
         report_lossless(report, "Kinect depth", &[millimetres], None)?;
         let metres = image("32FC1", depth.width, depth.height, &to_metres(&depth.data));
         report_lossless(report, "Kinect float depth", &[metres], None)?;
-    }
-    if let Some(disparity) = samples::motorcycle_disparity() {
-        let data: Vec<u8> = disparity.values.iter().flat_map(|value| value.to_le_bytes()).collect();
-        let message = image("32FC1", disparity.width, disparity.height, &data);
-        report_lossless(report, "float disparity", &[message], None)?;
     }
     Ok(())
 }
@@ -182,13 +164,12 @@ pub fn measure_corner_cases(report: &mut BenchReport) -> Result<()> {
     let mut worst = f64::MIN;
     for (name, message) in &cases {
         let mut frame = Vec::new();
-        let encoded = Encoder::new(Schema::Image).encode(Codec::Image, message, &mut frame);
+        Encoder::new(Schema::Image).encode(Codec::Image, message, &mut frame);
         let mut back = Vec::new();
         Decoder::new(message.len()).decode(&frame, &mut back)?;
         ensure!(back == *message, "{name} changed");
         let growth = frame.len() as f64 - message.len() as f64;
         worst = worst.max(growth);
-        println!("    {name:<18} {:>8} → {:>8} bytes by {}", message.len(), frame.len(), encoded.codec);
     }
     report.figure("corner cases: growth at worst", "B", worst).require(Target::AtMost(16.0));
     Ok(())

@@ -1,5 +1,4 @@
-//! The codec table of the publication, row by row, next to our results: space saved on recordings of the same kinds,
-//! and the distortion of lossy codecs.
+//! The codec table of the publication beside our results on recordings of the same kinds.
 
 use crate::messages::{grid, image};
 use crate::samples;
@@ -47,12 +46,12 @@ fn encode_and_decode(mut encoder: Encoder, codec: Codec, messages: &[Vec<u8>]) -
 }
 
 pub fn measure_published_table(report: &mut BenchReport) -> Result<()> {
-    println!("published table           published      ours  PSNR");
     let mut row = |kind: &str, published: f64, how: &str, outcome: &CompressionResult, target: bool| {
         let psnr = outcome.psnr.map_or_else(|| "lossless".to_owned(), |psnr| format!("{psnr:.1} dB"));
-        println!("    {kind:<10} {how:<24} {published:5.1}%  {:6.2}%  {psnr}", outcome.saved);
-        let title = format!("published {kind}: saved by {how}");
-        let figure = report.figure(title, "%", outcome.saved).relative_to("published", published).note(psnr);
+        let figure = report
+            .figure(format!("published {kind}: saved by {how}"), "%", outcome.saved)
+            .relative_to("published", published)
+            .note(psnr);
         if target {
             figure.require(Target::AtLeast(published));
         }

@@ -3,6 +3,7 @@
 //! The files hold MRPT's serialized objects: `length of the name | 0x80 · name · version · fields · 0x88`, little
 //! endian. Only the fields in front of the measurements are read, in the versions that the package has.
 
+use crate::columns::Fields;
 use crate::samples::Picture;
 use anyhow::{Context, Result, bail, ensure};
 use bench_report::BenchReport;
@@ -50,41 +51,24 @@ fn load(name: &str) -> Result<Vec<u8>> {
     Ok(unpacked)
 }
 
-/// Reads numbers one after the other.
-struct Fields<'a> {
-    rest: &'a [u8],
+/// Starts behind the version of the object whose class name begins at `at`.
+fn open_object<'a>(bytes: &'a [u8], at: usize, name: &str) -> Fields<'a> {
+    Fields { bytes, at: at + name.len() + 1 }
 }
 
-impl<'a> Fields<'a> {
-    /// Starts behind the version of the object whose class name begins at `at`.
-    fn of_object(file: &'a [u8], at: usize, name: &str) -> Self {
-        Self { rest: &file[at + name.len() + 1..] }
-    }
-
-    fn take(&mut self, count: usize) -> Result<&'a [u8]> {
-        let (front, rest) = self.rest.split_at_checked(count).context("a recording ends too early")?;
-        self.rest = rest;
-        Ok(front)
-    }
-
-    fn size(&mut self) -> Result<usize> {
-        Ok(u32::from_le_bytes(self.take(4)?.try_into()?) as usize)
-    }
-
-    fn skip_pose(&mut self) -> Result<()> {
-        let name = usize::from(self.take(1)?[0] & 0x7f);
-        self.take(name)?;
-        let fields = match self.take(1)?[0] {
-            // A matrix of 4×4, an object of its own.
-            1 => 1 + "CMatrixD".len() + 1 + 8 + 16 * 8 + 1,
-            2 => 7 * 8,
-            3 => 12 * 8,
-            version => bail!("a pose of version {version}"),
-        };
-        self.take(fields)?;
-        ensure!(self.take(1)? == [0x88], "a pose without its end");
-        Ok(())
-    }
+fn skip_pose(fields: &mut Fields<'_>) -> Result<()> {
+    let name = usize::from(fields.take(1)?[0] & 0x7f);
+    fields.take(name)?;
+    let bytes = match fields.take(1)?[0] {
+        // A matrix of 4×4, an object of its own.
+        1 => 1 + "CMatrixD".len() + 1 + 8 + 16 * 8 + 1,
+        2 => 7 * 8,
+        3 => 12 * 8,
+        version => bail!("a pose of version {version}"),
+    };
+    fields.take(bytes)?;
+    ensure!(fields.take(1)? == [0x88], "a pose without its end");
+    Ok(())
 }
 
 /// Returns the offsets of all objects of a class.
@@ -103,10 +87,10 @@ pub fn laser_ranges(name: &str) -> Result<Vec<Vec<f32>>> {
     let file = load(name)?;
     let mut scans = Vec::new();
     for at in find_objects(&file, CLASS) {
-        let mut fields = Fields::of_object(&file, at, CLASS);
+        let mut fields = open_object(&file, at, CLASS);
         // Aperture, direction, longest range.
         fields.take(9)?;
-        fields.skip_pose()?;
+        skip_pose(&mut fields)?;
         let count = fields.size()?;
         let ranges = fields.take(count * 4)?.chunks_exact(4);
         scans.push(ranges.map(|bytes| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect());
@@ -118,7 +102,7 @@ pub fn laser_ranges(name: &str) -> Result<Vec<Vec<f32>>> {
 pub fn occupancy_map(name: &str) -> Result<Picture> {
     const CLASS: &str = "COccupancyGridMap2D";
     let file = load(name)?;
-    let mut fields = Fields::of_object(&file, find_object(&file, CLASS)?, CLASS);
+    let mut fields = open_object(&file, find_object(&file, CLASS)?, CLASS);
     ensure!(fields.take(1)? == [8], "cells of another size than a byte");
     let (width, height) = (fields.size()?, fields.size()?);
     // Borders and resolution.
@@ -136,18 +120,18 @@ pub fn kinect_frame() -> Result<(Picture, Picture)> {
     const CLASS: &str = "CObservation3DRangeScan";
     const IMAGE: &str = "mrpt::img::CImage";
     let file = load(KINECT)?;
-    let mut fields = Fields::of_object(&file, find_object(&file, CLASS)?, CLASS);
+    let mut fields = open_object(&file, find_object(&file, CLASS)?, CLASS);
     // Longest range.
     fields.take(4)?;
-    fields.skip_pose()?;
+    skip_pose(&mut fields)?;
     ensure!(fields.take(1)? == [1], "a frame without points");
     let points = fields.size()?;
     // Three coordinates and two indices of each; then a flag and the unit of the depth.
     fields.take(points * 16 + 5)?;
     let (height, width) = (fields.size()?, fields.size()?);
     let depth = Picture { width, height, depth: 2, data: fields.take(width * height * 2)?.to_vec() };
-    let at = find_object(fields.rest, IMAGE)?;
-    let mut fields = Fields::of_object(fields.rest, at, IMAGE);
+    let rest = &file[fields.at..];
+    let mut fields = open_object(rest, find_object(rest, IMAGE)?, IMAGE);
     // Two flags, and the size again.
     fields.take(10)?;
     let pixels = fields.take(width * height * 3)?.chunks_exact(3);
@@ -159,12 +143,12 @@ pub fn kinect_frame() -> Result<(Picture, Picture)> {
 pub fn velodyne_packets() -> Result<Vec<u8>> {
     const CLASS: &str = "CObservationVelodyneScan";
     let file = load(VELODYNE)?;
-    let mut fields = Fields::of_object(&file, find_object(&file, CLASS)?, CLASS);
+    let mut fields = open_object(&file, find_object(&file, CLASS)?, CLASS);
     // Time, label, shortest and longest range.
     fields.take(8)?;
-    let label = fields.size()?;
-    fields.take(label + 16)?;
-    fields.skip_pose()?;
+    fields.text()?;
+    fields.take(16)?;
+    skip_pose(&mut fields)?;
     let count = fields.size()?;
     Ok(fields.take(count * PACKET)?.to_vec())
 }

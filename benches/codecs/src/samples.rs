@@ -1,5 +1,4 @@
-//! Input data: the recordings next to the repository if present, images from Debian packages otherwise, and synthetic
-//! corner cases.
+//! Input data: the recordings next to the repository if present, otherwise Debian packages and synthetic data.
 
 use anyhow::{Context, Result, bail};
 use std::fs::File;
@@ -8,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// A decoded image.
+#[derive(Clone)]
 pub struct Picture {
     pub width: usize,
     pub height: usize,
@@ -68,66 +68,17 @@ pub fn colour_frames() -> Result<Vec<Picture>> {
     Ok(frames.collect())
 }
 
-/// Photographs from packages: those of `opencv-doc`, and scikit-image's if they could be fetched.
+/// Photographs of Debian's `opencv-doc`.
 pub fn packaged_photographs() -> Result<Vec<Picture>> {
     let mut pictures = read_pictures(&opencv_samples_directory(), &["graf1.png", "graf3.png"])?;
-    if let Some(directory) = fetch_scikit_samples() {
-        let names = ["astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png"];
-        pictures.extend(self::read_pictures(&directory, &names)?);
-    }
     pictures.retain(|picture| picture.depth == 3);
     Ok(pictures)
 }
 
-/// Directory of scikit-image's samples; `None` if `samples.py` neither has fetched them nor can.
-fn fetch_scikit_samples() -> Option<PathBuf> {
-    let directory = bench_report::root().join("target/bench/samples");
-    if !directory.join("motorcycle_disp.f32").exists() {
-        let script = bench_report::root().join("benches/codecs/samples.py");
-        let status = Command::new("python3").arg(script).arg(&directory).status();
-        if !status.is_ok_and(|status| status.success()) {
-            eprintln!("scikit-image's samples are not at hand: they are left out");
-            return None;
-        }
-    }
-    Some(directory)
-}
-
-/// Depth frames: from the recordings, or from the packaged disparity image.
+/// Depth frames: from the recordings; none without them.
 pub fn depth_frames() -> Result<Vec<Picture>> {
-    match recordings_directory() {
-        Some(path) => read_pictures(&path, &["depth1.png", "depth2.png", "depth3.png"]),
-        None => Ok(motorcycle_disparity().iter().map(Disparity::to_depth).collect()),
-    }
-}
-
-/// A disparity image measured by structured light: one float per pixel, infinite if unknown.
-pub struct Disparity {
-    pub width: usize,
-    pub height: usize,
-    pub values: Vec<f32>,
-}
-
-impl Disparity {
-    /// Converts to depth in millimetres, zero if unknown: for Middlebury's 2014 rig, scaled to the image's size.
-    fn to_depth(&self) -> Picture {
-        let millimetre = |&disparity: &f32| {
-            let depth = 193.001 * 994.978 / (disparity + 32.778);
-            if depth.is_finite() && disparity.is_finite() { depth as u16 } else { 0 }
-        };
-        let data = self.values.iter().map(millimetre).flat_map(u16::to_le_bytes).collect();
-        Picture { width: self.width, height: self.height, depth: 2, data }
-    }
-}
-
-/// Disparity image of scikit-image's motorcycle; format: `height · width · floats`, little endian.
-pub fn motorcycle_disparity() -> Option<Disparity> {
-    let path = fetch_scikit_samples()?.join("motorcycle_disp.f32");
-    let bytes = std::fs::read(path).ok()?;
-    let size = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
-    let (height, width) = (size(0)?, size(4)?);
-    let values: Vec<f32> = bytes[8..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-    (values.len() == width * height).then_some(Disparity { width, height, values })
+    let names = ["depth1.png", "depth2.png", "depth3.png"];
+    recordings_directory().map_or_else(|| Ok(Vec::new()), |path| read_pictures(&path, &names))
 }
 
 /// Floor plan of an office, 566×608 cells, as an occupancy grid: unknown, free, occupied.

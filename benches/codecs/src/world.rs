@@ -1,5 +1,4 @@
-//! Simulated lasers and cameras: scans and clouds derived from the recordings in the form in which drivers publish
-//! them.
+//! Scans and clouds derived from the recordings, in the form in which drivers publish them.
 
 use crate::messages::{PointFieldType, cloud, scan};
 use crate::recorded::PACKET;
@@ -9,14 +8,14 @@ use crate::samples::{Noise, Picture};
 const CELL: f64 = 0.1;
 
 /// A free position on the floor, far from walls, with a heading.
-pub struct Pose {
-    pub x: f64,
-    pub y: f64,
-    pub heading: f64,
+struct Pose {
+    x: f64,
+    y: f64,
+    heading: f64,
 }
 
 /// Returns positions spread over the map.
-pub fn sample_poses(map: &Picture, count: usize) -> Vec<Pose> {
+fn sample_poses(map: &Picture, count: usize) -> Vec<Pose> {
     let free = |x: usize, y: usize| {
         (0..9).all(|at| {
             let (x, y) = (x + at % 3 * 4, y + at / 3 * 4);
@@ -36,7 +35,7 @@ pub fn sample_poses(map: &Picture, count: usize) -> Vec<Pose> {
 }
 
 /// Returns the distance along a ray to the next wall, at most 30 m; `None` if there is no wall.
-pub fn cast_ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
+fn cast_ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
     let (sin, cos) = (pose.heading + angle).sin_cos();
     let mut distance = 0.0;
     while distance < 30.0 {
@@ -52,8 +51,7 @@ pub fn cast_ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
     None
 }
 
-/// Scans of a laser with 1081 beams over 270 degrees and 10 mm of noise; `float` converts a distance in metres
-/// (infinite without an echo) into the value that the driver publishes.
+/// Scans of 1081 beams over 270 degrees with 10 mm of noise; `float` returns what the driver publishes for metres.
 pub fn laser_scans(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> Vec<Vec<u8>> {
     let mut noise = Noise(7);
     sample_poses(map, 12)
@@ -167,8 +165,7 @@ fn camera_cloud(
     cloud(width, height, step, &fields, &data)
 }
 
-/// One revolution each of a 16-ring laser in the office, with 2 mm resolution and 20 mm of noise; points without an
-/// echo are dropped. The packed layout of 22 bytes is the driver's.
+/// Revolutions of a 16-ring laser in the office, with 2 mm resolution and 20 mm of noise, in the driver's layout.
 pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
     let mut noise = Noise(11);
     sample_poses(map, 4)
@@ -260,41 +257,4 @@ fn laser_cloud(data: &[u8]) -> Vec<u8> {
         ("time", 18, PointFieldType::F32),
     ];
     cloud(data.len() / 22, 1, 22, &fields, data)
-}
-
-/// A map being built: the known cells after each of `count` stops, within a grid of `size`×`size` cells.
-pub fn maps_in_progress(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>> {
-    let mut cells = vec![255u8; size * size];
-    let (left, top) = ((size - map.width) / 2, (size - map.height) / 2);
-    let mut stops = sample_poses(map, count);
-    // Ordered like the path of a robot that always drives to the nearest remaining stop.
-    for index in 1..stops.len() {
-        let (x, y) = (stops[index - 1].x, stops[index - 1].y);
-        let distance = |pose: &Pose| (pose.x - x).powi(2) + (pose.y - y).powi(2);
-        let nearest = (index..stops.len()).min_by(|&a, &b| distance(&stops[a]).total_cmp(&distance(&stops[b])));
-        stops.swap(index, nearest.unwrap_or(index));
-    }
-    let mut grids = Vec::new();
-    for pose in &stops {
-        for beam in 0..2000 {
-            let angle = f64::from(beam) * std::f64::consts::TAU / 2000.0;
-            let end = cast_ray(map, pose, angle);
-            let (sin, cos) = (pose.heading + angle).sin_cos();
-            let mut distance = 0.0;
-            while distance < end.unwrap_or(12.0).min(12.0) {
-                let (x, y) = ((pose.x + cos * distance) / CELL, (pose.y + sin * distance) / CELL);
-                if x < 0.0 || y < 0.0 || x as usize >= map.width || y as usize >= map.height {
-                    break;
-                }
-                cells[(top + y as usize) * size + left + x as usize] = 0;
-                distance += CELL / 3.0;
-            }
-            if let Some(end) = end.filter(|&end| end < 12.0) {
-                let (x, y) = ((pose.x + cos * end) / CELL, (pose.y + sin * end) / CELL);
-                cells[(top + y as usize) * size + left + x as usize] = 100;
-            }
-        }
-        grids.push(cells.clone());
-    }
-    grids
 }

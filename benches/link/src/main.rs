@@ -4,8 +4,6 @@
 
 #![forbid(unsafe_code)]
 
-mod beside;
-mod idle;
 mod people;
 mod strings;
 
@@ -38,9 +36,6 @@ fn measure(all: bool) -> Result<()> {
         people::measure(&mut report, &daemon)?;
     }
     strings::measure(&mut report, &daemon)?;
-    if all {
-        beside::measure(&mut report, &daemon)?;
-    }
     report.finish()?;
     Ok(())
 }

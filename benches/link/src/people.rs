@@ -9,7 +9,7 @@ use ros::bus::{Bus, Publisher, QosProfile, Subscription};
 use ros::ros1::Ros1Bus;
 use support::daemon::Daemon;
 use support::people;
-use support::site::Site;
+use support::site::{NodeProcess, Site};
 
 const SIZE: (u32, u32) = (640, 480);
 
@@ -57,7 +57,7 @@ fn camera_image(stamp: u32) -> Bytes {
 }
 
 /// Returns the next word of a xorshift generator.
-pub fn next_noise(state: &mut u32) -> u32 {
+fn next_noise(state: &mut u32) -> u32 {
     *state ^= *state << 13;
     *state ^= *state >> 17;
     *state ^= *state << 5;
@@ -97,17 +97,27 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
             ways[index].times.push(took);
         }
     }
-    let [native_way, linked_way] = &mut ways;
-    let (alone, linked) =
-        (quantile_seconds(&native_way.times, 0.5) * 1e3, quantile_seconds(&linked_way.times, 0.5) * 1e3);
-    report
-        .figure("people_detect, picture in, found out: median", "ms", linked)
-        .relative_to("the same on the robot", alone)
-        .require(Target::RatioAtMost(1.05))
-        .note(format!("640x480, {rounds} pictures each, in turns"));
+    let [alone, linked] = ways.each_ref().map(|way| quantile_seconds(&way.times, 0.5) * 1e3);
+    let figure = report.figure("people_detect, picture in, found out: median", "ms", linked);
+    figure.relative_to("the same on the robot", alone).require(Target::RatioAtMost(1.05));
+    figure.note(format!("640x480, {rounds} pictures each, in turns"));
     let memory = Process::from_pid(stub.pid()).proportional()?;
     report.figure("memory of its stub, after that", "MB", memory).require(Target::AtMost(15.0)).note("PSS");
     drop((ways, native));
-    crate::idle::measure(report, &stub)?;
+    measure_idle(report, &stub)
+}
+
+/// Measures a connected stub without any requests.
+fn measure_idle(report: &mut BenchReport, stub: &NodeProcess) -> Result<()> {
+    let time = Duration::from_secs(if is_full_run() { 60 } else { 15 });
+    // Work that ends with the last subscriber has finished after this.
+    std::thread::sleep(Duration::from_secs(2));
+    let process = Process::from_pid(stub.pid());
+    let before = process.live_thread_time("")?;
+    std::thread::sleep(time);
+    let spent = process.live_thread_time("")? - before;
+    let share = spent.as_secs_f64() / time.as_secs_f64() * 100.0;
+    let figure = report.figure("processor, linked and idle", "% of a core", share);
+    figure.require(Target::AtMost(0.1)).note(format!("over {} s", time.as_secs()));
     Ok(())
 }

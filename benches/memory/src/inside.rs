@@ -4,15 +4,16 @@ use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
+use ros::ros1::process::MASTER;
+use ros::ros1::xmlrpc::Value;
 use serde_json::json;
-use servant::netns::NetNs;
 use support::robot::Robot;
 
-/// Address of the Master in every servant.
-const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
+use crate::Victim;
+
 /// Timeout of everything that is not an attack.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 const PARAMETERS: usize = 60;
 const READERS: usize = 30;
 const FRAMES: usize = 8;
@@ -25,68 +26,31 @@ fn connect(to: SocketAddr) -> Result<TcpStream> {
     Ok(stream)
 }
 
-/// Builds an XML-RPC call to the Master with string arguments.
-fn xml_rpc_request(method: &str, arguments: &[&str]) -> String {
-    let mut body = format!("<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>");
-    for argument in arguments {
-        body += &format!("<param><value><string>{argument}</string></value></param>");
-    }
-    body += "</params></methodCall>";
-    let length = body.len();
-    format!("POST / HTTP/1.1\r\nHost: master\r\nContent-Length: {length}\r\n\r\n{body}")
-}
-
-/// Reads one response of a kept-alive connection.
-fn read_answer(stream: &mut TcpStream) -> Result<String> {
-    let mut bytes = Vec::new();
-    let mut some = [0; 4096];
-    loop {
-        let read = stream.read(&mut some)?;
-        ensure!(read > 0, "the Master hung up");
-        bytes.extend_from_slice(&some[..read]);
-        let text = String::from_utf8_lossy(&bytes);
-        let Some((head, body)) = text.split_once("\r\n\r\n") else {
-            continue;
-        };
-        let length = head.lines().find_map(|line| {
-            let (name, value) = line.split_once(':')?;
-            let is_length = name.eq_ignore_ascii_case("content-length");
-            is_length.then(|| value.trim().parse::<usize>().ok())?
-        });
-        if body.len() >= length.context("a length")? {
-            return Ok(body.to_owned());
-        }
-    }
-}
-
-fn call_master(method: &str, arguments: &[&str]) -> Result<String> {
-    let mut stream = connect(MASTER)?;
-    stream.write_all(xml_rpc_request(method, arguments).as_bytes())?;
-    read_answer(&mut stream)
-}
-
 /// Sets parameters and requests all of them repeatedly without reading the responses.
-pub(crate) fn flood_parameters(network: &NetNs) -> Result<String> {
-    network.run(|| {
-        let value = "x".repeat(1_000_000);
-        let mut refused = 0;
-        for number in 0..PARAMETERS {
-            let name = format!("/attack/p{number}");
-            let told = call_master("setParam", &["/attacker", &name, &value]);
-            refused += usize::from(told.is_err() || told.is_ok_and(|told| !told.contains(">1<")));
-        }
+pub(crate) fn flood_parameters(victim: &Victim) -> Result<String> {
+    let value = "x".repeat(1_000_000);
+    let is_refused = |number: &usize| {
+        let told = victim.call_master("setParam", &[&format!("/attack/p{number}"), &value]);
+        !told.is_ok_and(|told| told.as_array().is_some_and(|told| told.first().and_then(Value::as_int) == Some(1)))
+    };
+    let refused = (0..PARAMETERS).filter(is_refused).count();
+    let parameters = ["/attacker", "/"].map(|text| format!("<param><value><string>{text}</string></value></param>"));
+    let body = format!(
+        "<?xml version=\"1.0\"?><methodCall><methodName>getParam</methodName><params>{}</params></methodCall>",
+        parameters.concat()
+    );
+    let request = format!("POST / HTTP/1.1\r\nHost: master\r\nContent-Length: {}\r\n\r\n{body}", body.len());
+    victim.network.run(|| {
         let mut unread = Vec::new();
         for _ in 0..READERS {
             let mut stream = connect(MASTER)?;
-            stream.write_all(xml_rpc_request("getParam", &["/attacker", "/"]).as_bytes())?;
+            stream.write_all(request.as_bytes())?;
+            stream.set_nonblocking(true)?;
             unread.push(stream);
         }
         // Waits until one of the requests is being answered, and a little longer.
         let until = Instant::now() + PATIENCE;
         let answered = |stream: &TcpStream| stream.peek(&mut [0]).is_ok_and(|read| read > 0);
-        for stream in &unread {
-            stream.set_nonblocking(true)?;
-        }
         while Instant::now() < until && !unread.iter().any(answered) {
             std::thread::sleep(Duration::from_millis(50));
         }
@@ -97,23 +61,20 @@ pub(crate) fn flood_parameters(network: &NetNs) -> Result<String> {
 }
 
 /// Calls a service of the robot with requests that never end.
-pub(crate) fn send_unfinished_requests(network: &NetNs, robot: &mut Robot) -> Result<String> {
+pub(crate) fn send_unfinished_requests(victim: &Victim, robot: &mut Robot) -> Result<String> {
     let service_type = robot.call("/rosapi/service_type", json!({"service": "/add_two"}))?;
     robot.send(json!({
         "op": "advertise_service", "service": "/attacked", "type": service_type["values"]["type"],
     }))?;
     // The service is registered by the time this call is answered.
     robot.call("/rosapi/services", json!({}))?;
-    network.run(|| {
-        let told = call_master("lookupService", &["/attacker", "/attacked"])?;
-        // The response contains the URI twice, the first time within a sentence.
-        let (_, rest) = told.rsplit_once("rosrpc://").with_context(|| told.clone())?;
-        let address = rest.split(['/', '<']).next().unwrap_or_default();
-        let (_, port) = address.rsplit_once(':').context("a port")?;
-        let to = SocketAddr::from((Ipv4Addr::LOCALHOST, port.parse()?));
+    let told = victim.call_master("lookupService", &["/attacked"])?;
+    let uri = told.as_array().and_then(|told| told.get(2)?.as_str()).with_context(|| format!("{told:?}"))?;
+    let port = uri.trim_end_matches('/').rsplit(':').next().context("a port")?;
+    let to = SocketAddr::from((Ipv4Addr::LOCALHOST, port.parse()?));
+    victim.network.run(|| {
         let results: Vec<_> = std::thread::scope(|scope| {
-            let frames = (0..FRAMES).map(|_| scope.spawn(move || send_unfinished_request(to)));
-            let frames: Vec<_> = frames.collect();
+            let frames: Vec<_> = (0..FRAMES).map(|_| scope.spawn(move || send_unfinished_request(to))).collect();
             frames.into_iter().map(|frame| frame.join()).collect()
         });
         let mut sent = Vec::new();
@@ -152,23 +113,14 @@ fn send_unfinished_request(to: SocketAddr) -> Result<(u32, TcpStream)> {
 }
 
 /// Sends small requests to the Master for `time` from four connections.
-pub(crate) fn drive_master(network: &NetNs, time: Duration) -> Result<()> {
-    network.run(|| {
-        let until = Instant::now() + time;
-        let asks = || -> Result<()> {
-            let mut stream = connect(MASTER)?;
-            while Instant::now() < until {
-                stream.write_all(xml_rpc_request("getPid", &["/attacker"]).as_bytes())?;
-                read_answer(&mut stream)?;
-            }
-            Ok(())
-        };
-        std::thread::scope(|scope| {
-            let all: Vec<_> = (0..4).map(|_| scope.spawn(asks)).collect();
-            for one in all {
-                one.join().map_err(|_| anyhow::anyhow!("an attacker panicked"))??;
-            }
-            Ok(())
-        })
-    })?
+pub(crate) fn drive_master(victim: &Victim, time: Duration) -> Result<()> {
+    let until = Instant::now() + time;
+    let asks = async || -> Result<()> {
+        while Instant::now() < until {
+            victim.master.call("getPid", &["/attacker".into()], PATIENCE).await?;
+        }
+        Ok(())
+    };
+    victim.runtime.block_on(async { tokio::try_join!(asks(), asks(), asks(), asks()) })?;
+    Ok(())
 }

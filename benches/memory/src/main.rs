@@ -1,20 +1,25 @@
-//! `make bench ONLY=memory`: memory and processor time that robots and nodes can make the daemon and a servant's shim
-//! use. The attacks are those with which the first release was measured; its figures are the reference. Needs root.
+//! `make bench ONLY=memory`: what robots and nodes can make the daemon and a shim use, by the attacks with which the
+//! first release was measured. Needs root.
 
 #![forbid(unsafe_code)]
 
 mod inside;
 mod outside;
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use bench_report::{BenchDaemon, BenchReport, Process, Target};
+use reach::ServantSockets;
+use ros::ros1::process::MASTER;
+use ros::ros1::xmlrpc::{Value, XmlRpcClient};
 use serde_json::json;
 use servant::launch::{self, RuntimeRecord};
 use servant::netns::NetNs;
 use support::daemon::Daemon;
 use support::robot::Robot;
+use tokio::runtime::{Builder, Runtime};
 
 /// Default memory budget of a client, of a servant and of a shim, in megabytes (10⁶).
 const LIMIT: f64 = 268.0;
@@ -29,7 +34,10 @@ const DRIVEN: Duration = Duration::from_secs(5);
 /// A servant, as seen by its attackers.
 pub(crate) struct Victim {
     /// Network namespace of its nodes.
-    pub(crate) network: NetNs,
+    pub(crate) network: Arc<NetNs>,
+    /// The ROS Master, and the runtime in which it is asked.
+    pub(crate) master: XmlRpcClient,
+    pub(crate) runtime: Runtime,
     /// Process that runs its Master.
     pub(crate) shim: Process,
 }
@@ -42,7 +50,17 @@ impl Victim {
         let path = daemon.home.join("servants").join(id).join(launch::RUNTIME);
         let runtime: RuntimeRecord = launch::read_record(&path)?.context("a running servant")?;
         let node = servant["pids"][0].as_i64().context("a node")?;
-        Ok(Self { network: NetNs::from_pid(i32::try_from(node)?)?, shim: Process::from_pid(runtime.shim.pid) })
+        let network = Arc::new(NetNs::from_pid(i32::try_from(node)?)?);
+        let master = XmlRpcClient::new(Arc::new(ServantSockets::new(&network)), &format!("http://{MASTER}/"))?;
+        let shim = Process::from_pid(runtime.shim.pid);
+        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        Ok(Self { network, master, runtime, shim })
+    }
+
+    /// Calls the Master as a node.
+    pub(crate) fn call_master(&self, method: &str, arguments: &[&str]) -> Result<Value> {
+        let arguments: Vec<Value> = ["/attacker"].iter().chain(arguments).map(|&argument| argument.into()).collect();
+        Ok(self.runtime.block_on(self.master.call(method, &arguments, inside::PATIENCE))?)
     }
 }
 
@@ -109,10 +127,10 @@ fn main() -> Result<()> {
     let mut other = daemon.robot("adder_py?robot=other")?;
     other.call("/add_two", json!({"a": 1, "b": 1}))?;
     let other = Victim::for_robot(&daemon, "adder_py", "other")?;
-    attack(&mut report, name, &other.shim, first(3300.0), || inside::flood_parameters(&other.network))?;
+    attack(&mut report, name, &other.shim, first(3300.0), || inside::flood_parameters(&other))?;
     answered()?;
     let name = "daemon: 8 unfinished TCPROS frames of 250 MB";
-    attack(&mut report, name, whole, first(2100.0), || inside::send_unfinished_requests(&victim.network, &mut robot))?;
+    attack(&mut report, name, whole, first(2100.0), || inside::send_unfinished_requests(&victim, &mut robot))?;
     answered()?;
     /// Begins an attack; returns what it did.
     type Attack = fn(&Daemon) -> Result<String>;
@@ -139,14 +157,11 @@ fn main() -> Result<()> {
     robot.call("/add_two", json!({"a": 1, "b": 1}))?;
     let small = Victim::for_robot(&daemon, "small", "small")?;
     let (began, before) = (Instant::now(), small.shim.total_processor_time()?);
-    inside::drive_master(&small.network, DRIVEN)?;
+    inside::drive_master(&small, DRIVEN)?;
     let cores = (small.shim.total_processor_time()? - before).as_secs_f64() / began.elapsed().as_secs_f64();
-    let title = "shim of a servant with 0.1 cores, asked all the time";
-    report
-        .figure(title, "cores", cores)
-        .relative_to("first release", 0.41)
-        .require(Target::AtMost(0.12))
-        .note(format!("over {DRIVEN:?}, from 4 connections"));
+    let figure = report.figure("shim of a servant with 0.1 cores, asked all the time", "cores", cores);
+    figure.relative_to("first release", 0.41).require(Target::AtMost(0.12));
+    figure.note(format!("over {DRIVEN:?}, from 4 connections"));
     report.finish()?;
     Ok(())
 }

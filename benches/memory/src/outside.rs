@@ -5,7 +5,7 @@ use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use rosbridge::{Compression, Format, Op, Payload, Publish, Writer};
+use rosbridge::{Format, Writer};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::robot::Robot;
@@ -71,21 +71,12 @@ fn publish_array(robot: &mut Robot, topic: &str, elements: usize, element: i8) -
     let mut bytes = vec![0; 8];
     bytes.extend_from_slice(&u32::try_from(elements)?.to_le_bytes());
     bytes.resize(12 + elements, element as u8);
-    let mut message = Vec::new();
-    let mut writer = Writer::new(&mut message, Format::Cbor);
-    writer.bytes("bytes", &bytes);
-    writer.end();
-    let op = Op::from(Publish {
-        id: None,
-        topic: topic.into(),
-        msg: Payload::cbor(&message),
-        compression: Compression::CborRaw,
-        latch: false,
-        type_name: None,
-        qos: None,
-    });
     let mut out = Vec::new();
-    op.print(&mut out, Format::Cbor);
+    let mut writer = Writer::op(&mut out, Format::Cbor, "publish", None);
+    writer.text("topic", topic);
+    writer.text("compression", "cbor-raw");
+    writer.raw("msg", None, &bytes);
+    writer.end();
     robot.send_frame(Message::binary(out))
 }
 

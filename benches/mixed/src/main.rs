@@ -1,7 +1,5 @@
-//! `make bench ONLY=mixed`: what it costs that a robot's ROS is not its service's. Messages are carried to the other
-//! ROS and, in turns with it, copied, which is the least that a message of the same ROS costs on its way.
-//!
-//! The arguments name the parts to run (small, picture, path); without arguments all parts run.
+//! `make bench ONLY=mixed`: what it costs that a robot's ROS is not its service's, beside a copy of the same message.
+//! Arguments name the parts to run.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -79,10 +77,8 @@ fn measure(
         });
         let times = race.run();
         let micros = |index: usize| times[index].best_micros() / repeats as f64;
-        report
-            .figure(format!("{name}, {} bytes, {way}", message.len()), "µs", micros(0))
-            .relative_to("a copy", micros(1))
-            .require(target(micros(1)));
+        let figure = report.figure(format!("{name}, {} bytes, {way}", message.len()), "µs", micros(0));
+        figure.relative_to("a copy", micros(1)).require(target(micros(1)));
     }
     Ok(())
 }

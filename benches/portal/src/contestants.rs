@@ -1,17 +1,16 @@
-//! Paths from a client to the node and back. Each path is open during its own turn only, because a subscription of one
-//! path would receive messages during the turns of the others.
+//! Paths from a client to the node and back, each open during its own turn only.
 
 use std::fmt;
+use std::net::TcpStream;
 
 use anyhow::{Context, Result, ensure};
 use base64::prelude::{BASE64_STANDARD, Engine as _};
 use bench_report::BenchDaemon;
 use rosbridge::{Format, Writer};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::line::{self, BenchConnection, Framing};
-use crate::node::{IMAGE, MeterNode, MeterSockets, STRING, TypeDescription};
-use crate::raw::RawNode;
+use crate::node::{IMAGE, MeterNode, STRING, TypeDescription};
 use crate::relay::{Relay, RelayHops};
 use crate::suite;
 
@@ -59,7 +58,8 @@ pub(crate) struct OpenPath {
     pub(crate) message: Vec<u8>,
     /// Dropped after the connection.
     _relay: Option<Relay>,
-    raw: Option<(RawNode, Option<String>)>,
+    /// Topic to unregister in the end.
+    published: Option<String>,
 }
 
 /// The daemon, the node and the topics or service that all paths are opened to.
@@ -81,19 +81,17 @@ impl PathTarget<'_> {
             self.node.wait_until_connected(topic, 0)?;
         }
         let open = match way {
-            ClientPath::Daemon(encoding) => self.open_daemon(encoding)?,
-            ClientPath::Bytes | ClientPath::Values => self.open_relay(way == ClientPath::Values)?,
-            ClientPath::Direct => self.open_direct()?,
+            ClientPath::Daemon(encoding) => {
+                self.open_rosbridge(BenchConnection::connect_robot(self.daemon)?, encoding)?
+            }
+            ClientPath::Bytes | ClientPath::Values => self.open_raw(Some(way == ClientPath::Values))?,
+            ClientPath::Direct => self.open_raw(None)?,
             ClientPath::Suite => self.open_rosbridge(suite::connect_client(self.node)?, Encoding::Json)?,
         };
         for topic in topics.into_iter().flatten() {
             self.node.wait_until_connected(topic, 1)?;
         }
         Ok(open)
-    }
-
-    fn open_daemon(&self, encoding: Encoding) -> Result<OpenPath> {
-        self.open_rosbridge(BenchConnection::connect_robot(self.daemon)?, encoding)
     }
 
     /// Sets up rosbridge on a connection to a server that speaks its protocol.
@@ -105,84 +103,70 @@ impl PathTarget<'_> {
                 Encoding::Cbor => "cbor",
                 Encoding::Raw => "cbor-raw",
             };
-            line.send_text(&format!(
-                r#"{{"op":"subscribe","topic":"{topic}","type":"{}","compression":"{compression}"}}"#,
-                kind.name
-            ))?;
+            let op = json!({"op": "subscribe", "topic": topic, "type": kind.name, "compression": compression});
+            line.send_text(&op.to_string())?;
         }
         if let Some(topic) = self.hops.inward {
-            line.send_text(&format!(
-                r#"{{"op":"advertise","topic":"{topic}","type":"{}","queue_size":1000}}"#,
-                kind.name
-            ))?;
+            let op = json!({"op": "advertise", "topic": topic, "type": kind.name, "queue_size": 1000});
+            line.send_text(&op.to_string())?;
             message = publish_op(topic, self.hops.images, encoding);
         }
         if let Some(service) = self.hops.service {
-            message = line::frame(line::TEXT, call_op(service).as_bytes());
+            let op = json!({"op": "call_service", "id": "1", "service": service, "args": {"a": 1, "b": 2}});
+            message = line::frame(line::TEXT, op.to_string().as_bytes());
         }
-        Ok(OpenPath { line, message, _relay: None, raw: None })
+        Ok(OpenPath { line, message, _relay: None, published: None })
     }
 
-    fn open_relay(&self, values: bool) -> Result<OpenPath> {
-        let hops = RelayHops { values, ..self.hops };
-        let relay = Relay::start(self.node.pid, hops)?;
-        let (line, message) = if values {
-            let line = BenchConnection::connect_websocket(&relay.address, "")?;
-            let message = hops.inward.map_or_else(Vec::new, |topic| publish_op(topic, hops.images, Encoding::Json));
-            (line, message)
-        } else {
-            let stream = std::net::TcpStream::connect(&relay.address)?;
-            (BenchConnection::new(stream, self.framing())?, self.framed_message())
-        };
-        Ok(OpenPath { line, message, _relay: Some(relay), raw: None })
-    }
-
-    fn open_direct(&self) -> Result<OpenPath> {
-        let (node, kind) = (self.node, self.message_type());
-        let inside = MeterSockets::for_process(node.pid)?;
-        let start = RawNode::start(inside, "/bench_direct");
-        let raw = node.runtime.block_on(start)?;
-        let sender = match self.hops.inward {
-            Some(topic) => Some(node.runtime.block_on(raw.publish(topic, kind))?),
-            None => None,
-        };
-        let receiver = match (self.hops.outward, self.hops.service) {
-            (Some(topic), _) => node.runtime.block_on(raw.subscribe(topic, kind))?,
-            (None, Some(service)) => node.runtime.block_on(raw.connect_service(service))?,
-            (None, None) => sender.as_ref().context("a topic")?.try_clone()?,
-        };
-        let mut line = BenchConnection::new(receiver, self.framing())?;
-        if let Some(sender) = sender {
-            line = line.with_sender(sender)?;
+    /// Opens bare connections to the node; with `relay` a process between them and the client, which converts through
+    /// values if that is true.
+    fn open_raw(&self, relay: Option<bool>) -> Result<OpenPath> {
+        let (node, kind, hops) = (self.node, self.message_type(), self.hops);
+        let publish = |topic| node.runtime.block_on(node.raw.publish(topic, kind));
+        let mut to = hops.inward.map(publish).transpose()?;
+        let mut from = hops.outward.map(|topic| node.runtime.block_on(node.raw.subscribe(topic, kind))).transpose()?;
+        if let Some(service) = hops.service {
+            let stream = node.runtime.block_on(node.raw.connect_service(service))?;
+            (to, from) = (Some(stream.try_clone()?), Some(stream));
         }
-        Ok(OpenPath {
-            line,
-            message: self.framed_message(),
-            _relay: None,
-            raw: Some((raw, self.hops.inward.map(str::to_owned))),
-        })
+        let mut message = self.framed_message();
+        let (line, relay) = match relay {
+            Some(values) => {
+                let (relay, client) = Relay::start(values, hops, from, to)?;
+                let line = if values {
+                    let publication = hops.inward.map(|topic| publish_op(topic, hops.images, Encoding::Json));
+                    message = publication.unwrap_or_default();
+                    BenchConnection::upgrade(client, "127.0.0.1", "")?
+                } else {
+                    BenchConnection::new(client, self.framing())?
+                };
+                (line, Some(relay))
+            }
+            None => {
+                let receiver = from.or(to.as_ref().map(TcpStream::try_clone).transpose()?).context("a topic")?;
+                let line = BenchConnection::new(receiver, self.framing())?;
+                (line.with_sender(to)?, None)
+            }
+        };
+        Ok(OpenPath { line, message, _relay: relay, published: hops.inward.map(str::to_owned) })
     }
 
     fn framing(&self) -> Framing {
-        match self.hops.service {
-            Some(_) => Framing::Response,
-            None => Framing::Tcpros,
-        }
+        if self.hops.service.is_some() { Framing::Response } else { Framing::Tcpros }
     }
 
     /// Returns the message or request in ROS serialization, framed for TCPROS.
     fn framed_message(&self) -> Vec<u8> {
-        match self.hops.service {
-            Some(_) => line::tcpros_frame(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]),
-            None => line::tcpros_frame(&serialize_message(self.hops.images)),
-        }
+        let request = || [1_i64, 2].map(i64::to_le_bytes).concat();
+        let message = self.hops.service.map_or_else(|| serialize_message(self.hops.images), |_| request());
+        line::tcpros_frame(&message)
     }
 
     /// Closes a path and unregisters its topics.
     pub(crate) fn close(&self, open: OpenPath) -> Result<()> {
         drop(open.line);
-        if let Some((raw, Some(topic))) = &open.raw {
-            self.node.runtime.block_on(raw.unpublish(topic))?;
+        if let Some(topic) = &open.published {
+            self.node.runtime.block_on(self.node.raw.unpublish(topic))?;
         }
         Ok(())
     }
@@ -264,9 +248,4 @@ fn publish_op(topic: &str, images: bool, encoding: Encoding) -> Vec<u8> {
     }
     writer.end();
     line::frame(opcode, &out)
-}
-
-/// Returns a service call in JSON.
-fn call_op(service: &str) -> String {
-    format!(r#"{{"op":"call_service","id":"1","service":"{service}","args":{{"a":1,"b":2}}}}"#)
 }

@@ -1,12 +1,9 @@
-//! WebSocket framing on the server side alone: the crate `ws` compared with tokio-tungstenite, fastwebsockets and a
-//! bare socket.
-//!
-//! One connection on loopback; the peer is a thread that writes prepared frames, or reads and discards. Each figure is
-//! the processor time of the server's thread per message, including system calls: the best of [`ROUNDS`] rounds, taken
-//! in turns.
+//! WebSocket framing on the server side alone: `ws` compared with tokio-tungstenite, fastwebsockets and a bare socket.
+//! Each figure is the processor time of the server's thread per message, with system calls: the best of [`ROUNDS`]
+//! alternating rounds. The peer is a thread that writes prepared frames, or reads and discards.
 
 use std::future::poll_fn;
-use std::io::{Read, Write};
+use std::io::{self, BufReader, Write};
 use std::net::{Ipv4Addr, TcpListener, TcpStream};
 use std::thread;
 use std::time::Duration;
@@ -19,6 +16,7 @@ use futures_util::{SinkExt, StreamExt};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::frame::{self, Frame as RawFrame};
 use tokio_tungstenite::tungstenite::protocol::{self, WebSocketConfig};
 
 /// Number of counted rounds; one warm-up round comes before them.
@@ -74,15 +72,13 @@ pub fn measure(report: &mut BenchReport, only: &str) -> Result<()> {
                 }
             }
             let [ours, tungstenite, fast, socket] = best.map(|best| best.as_secs_f64() * 1e6 / count as f64);
-            report
-                .figure(name, "µs", ours)
-                .relative_to("tokio-tungstenite", tungstenite)
-                .require(Target::RatioAtMost(1.0))
-                .note(format!(
-                    "fastwebsockets {fast:.2} µs (ratio {:.2}); the socket alone {socket:.2} µs (ratio {:.2})",
-                    ours / fast,
-                    ours / socket
-                ));
+            let figure = report.figure(name, "µs", ours);
+            figure.relative_to("tokio-tungstenite", tungstenite).require(Target::RatioAtMost(1.0));
+            let (beside_fast, beside_socket) = (ours / fast, ours / socket);
+            figure.note(format!(
+                "fastwebsockets {fast:.2} µs (ratio {beside_fast:.2}); the socket alone {socket:.2} µs (ratio \
+                 {beside_socket:.2})"
+            ));
         }
     }
     Ok(())
@@ -96,6 +92,7 @@ fn measure_round(framing: WebSocketLibrary, load: FramingLoad) -> Result<Duratio
     server.set_nodelay(true)?;
     server.set_nonblocking(true)?;
     let other = thread::spawn(move || run_client(client, load));
+    let total = (load.count * frame_message(load)?.len()) as u64;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
     let start = thread_processor_time();
     runtime.block_on(async {
@@ -107,66 +104,40 @@ fn measure_round(framing: WebSocketLibrary, load: FramingLoad) -> Result<Duratio
             (WebSocketLibrary::Tungstenite, false) => write_with_tungstenite(server, load).await,
             (WebSocketLibrary::Fast, true) => read_with_fastwebsockets(server, load).await,
             (WebSocketLibrary::Fast, false) => write_with_fastwebsockets(server, load).await,
-            (WebSocketLibrary::Socket, true) => read_from_socket(server, load).await,
-            (WebSocketLibrary::Socket, false) => write_to_socket(server, load).await,
+            (WebSocketLibrary::Socket, true) => read_from_socket(server, total).await,
+            (WebSocketLibrary::Socket, false) => write_to_socket(server, total).await,
         }
     })?;
     let took = thread_processor_time() - start;
     let transferred = other.join().ok().context("the client's thread panicked")??;
-    let expected = load.count * (load.bytes + header(load).len());
-    ensure!(transferred == expected, "{transferred} bytes passed, not {expected}");
+    ensure!(transferred == total, "{transferred} bytes passed, not {total}");
     Ok(took)
-}
-
-/// Returns the header of a message; frames of clients are masked.
-fn header(load: FramingLoad) -> Vec<u8> {
-    let mut header = vec![0x82];
-    let mask = if load.inward { 0x80 } else { 0 };
-    match load.bytes {
-        short @ 0..126 => header.push(mask | short as u8),
-        medium @ 126..0x1_0000 => {
-            header.push(mask | 126);
-            header.extend((medium as u16).to_be_bytes());
-        }
-        long => {
-            header.push(mask | 127);
-            header.extend((long as u64).to_be_bytes());
-        }
-    }
-    if load.inward {
-        header.extend(MASK);
-    }
-    header
 }
 
 fn payload(load: FramingLoad) -> Vec<u8> {
     (0..load.bytes).map(|index| (index * 7) as u8).collect()
 }
 
+/// Returns a message as it is sent; frames of clients are masked.
+fn frame_message(load: FramingLoad) -> Result<Vec<u8>> {
+    let mut frame = RawFrame::message(payload(load), frame::coding::OpCode::Data(frame::coding::Data::Binary), true);
+    frame.header_mut().mask = load.inward.then_some(MASK);
+    let mut bytes = Vec::new();
+    frame.format(&mut bytes)?;
+    Ok(bytes)
+}
+
 /// Writes the frames for the server, or reads those from it; returns the number of bytes.
-fn run_client(mut client: TcpStream, load: FramingLoad) -> Result<usize> {
+fn run_client(mut client: TcpStream, load: FramingLoad) -> Result<u64> {
     if !load.inward {
-        let mut buffer = vec![0; 1 << 20];
-        let mut total = 0;
-        loop {
-            match client.read(&mut buffer)? {
-                0 => return Ok(total),
-                read => total += read,
-            }
-        }
+        return Ok(io::copy(&mut BufReader::with_capacity(1 << 20, client), &mut io::sink())?);
     }
-    let mut frame = header(load);
-    let masked = payload(load);
-    frame.extend(masked.iter().zip(MASK.iter().cycle()).map(|(a, b)| a ^ b));
-    let together = (BATCH / frame.len()).clamp(1, load.count);
-    let batch = frame.repeat(together);
-    let mut left = load.count * frame.len();
-    while left > 0 {
-        let part = &batch[..batch.len().min(left)];
-        client.write_all(part)?;
-        left -= part.len();
+    let frame = frame_message(load)?;
+    let (total, batch) = (load.count * frame.len(), frame.repeat((BATCH / frame.len()).clamp(1, load.count)));
+    for at in (0..total).step_by(batch.len()) {
+        client.write_all(&batch[..batch.len().min(total - at)])?;
     }
-    Ok(load.count * frame.len())
+    Ok(total as u64)
 }
 
 async fn read_with_ws(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
@@ -245,25 +216,17 @@ async fn write_with_fastwebsockets(server: tokio::net::TcpStream, load: FramingL
     Ok(())
 }
 
-async fn read_from_socket(mut server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
-    let mut buffer = vec![0; BATCH];
-    let mut left = load.count * (load.bytes + header(load).len());
-    while left > 0 {
-        match server.read(&mut buffer).await? {
-            0 => bail!("the connection ended"),
-            read => left -= read,
-        }
-    }
+async fn read_from_socket(server: tokio::net::TcpStream, total: u64) -> Result<()> {
+    let mut reader = tokio::io::BufReader::with_capacity(BATCH, server.take(total));
+    let read = tokio::io::copy_buf(&mut reader, &mut tokio::io::sink()).await?;
+    ensure!(read == total, "the connection ended after {read} bytes");
     Ok(())
 }
 
-async fn write_to_socket(mut server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
-    let buffer = vec![0; BATCH];
-    let mut left = load.count * (load.bytes + header(load).len());
-    while left > 0 {
-        let part = &buffer[..buffer.len().min(left)];
-        server.write_all(part).await?;
-        left -= part.len();
+async fn write_to_socket(mut server: tokio::net::TcpStream, total: u64) -> Result<()> {
+    let (total, buffer) = (total as usize, vec![0; BATCH]);
+    for at in (0..total).step_by(BATCH) {
+        server.write_all(&buffer[..BATCH.min(total - at)]).await?;
     }
     Ok(())
 }

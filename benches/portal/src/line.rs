@@ -1,5 +1,4 @@
-//! The client's end of a connection: sends prepared messages and counts the frames that arrive. It does as little work
-//! as possible, the same for all contestants, so that the measurement covers what lies between the ends.
+//! The client's end of a connection: sends prepared messages and counts frames, with as little work as possible.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -9,7 +8,7 @@ use bench_report::BenchDaemon;
 use tokio_tungstenite::tungstenite;
 
 use crate::node::PATIENCE;
-use crate::tls::{self, BenchTlsStream};
+use crate::tls;
 
 /// URL path of the robot that all measurements use.
 pub(crate) const ROBOT: &str = "meter?robot=bench";
@@ -26,16 +25,15 @@ pub(crate) enum Framing {
 }
 
 /// A socket with or without TLS.
-enum LineStream {
-    Plain(TcpStream),
-    Tls(Box<BenchTlsStream>),
-}
+trait LineStream: Read + Write + Send {}
+
+impl<T: Read + Write + Send> LineStream for T {}
 
 /// A client's connection.
 pub(crate) struct BenchConnection {
     /// Connection to send on, if it is not the one that is read.
     sender: Option<TcpStream>,
-    stream: LineStream,
+    stream: Box<dyn LineStream>,
     framing: Framing,
     /// `buffer[at..filled]` has been read and not yet parsed.
     buffer: Vec<u8>,
@@ -50,11 +48,12 @@ impl BenchConnection {
     pub(crate) fn new(stream: TcpStream, framing: Framing) -> Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(PATIENCE))?;
-        Ok(Self::with_stream(LineStream::Plain(stream), framing))
+        Ok(Self::with_stream(stream, framing))
     }
 
-    fn with_stream(stream: LineStream, framing: Framing) -> Self {
-        Self { sender: None, stream, framing, buffer: vec![0; 256 << 10], at: 0, filled: 0, missing: None }
+    fn with_stream(stream: impl LineStream + 'static, framing: Framing) -> Self {
+        let (stream, buffer) = (Box::new(stream), vec![0; 256 << 10]);
+        Self { sender: None, stream, framing, buffer, at: 0, filled: 0, missing: None }
     }
 
     /// Connects as the robot to a daemon, through TLS if the daemon uses it.
@@ -65,18 +64,15 @@ impl BenchConnection {
         let stream = tls::connect(daemon)?;
         let url = format!("wss://localhost/{ROBOT}&token={token}");
         match tungstenite::client(url, stream) {
-            Ok((socket, _)) => {
-                let stream = LineStream::Tls(Box::new(socket.into_inner()));
-                Ok(Self::with_stream(stream, Framing::WebSocket))
-            }
+            Ok((socket, _)) => Ok(Self::with_stream(socket.into_inner(), Framing::WebSocket)),
             Err(error) => bail!("no WebSocket through TLS: {error}"),
         }
     }
 
-    /// Uses another connection for sending.
-    pub(crate) fn with_sender(mut self, sender: TcpStream) -> Result<Self> {
-        sender.set_nodelay(true)?;
-        self.sender = Some(sender);
+    /// Uses another connection for sending, if there is one.
+    pub(crate) fn with_sender(mut self, sender: Option<TcpStream>) -> Result<Self> {
+        sender.iter().try_for_each(|sender| sender.set_nodelay(true))?;
+        self.sender = sender;
         Ok(self)
     }
 
@@ -98,14 +94,11 @@ impl BenchConnection {
 
     /// Sends bytes that are already framed.
     pub(crate) fn send(&mut self, framed: &[u8]) -> Result<()> {
-        match (&mut self.sender, &mut self.stream) {
-            (Some(stream), _) | (None, LineStream::Plain(stream)) => stream.write_all(framed)?,
-            (None, LineStream::Tls(stream)) => {
-                stream.write_all(framed)?;
-                stream.flush()?;
-            }
+        if let Some(sender) = &mut self.sender {
+            return Ok(sender.write_all(framed)?);
         }
-        Ok(())
+        self.stream.write_all(framed)?;
+        Ok(self.stream.flush()?)
     }
 
     /// Sends a text message.
@@ -203,11 +196,7 @@ impl BenchConnection {
             self.buffer.copy_within(self.at..self.filled, 0);
             (self.at, self.filled) = (0, self.filled - self.at);
         }
-        let space = &mut self.buffer[self.filled..];
-        let read = match &mut self.stream {
-            LineStream::Plain(stream) => stream.read(space)?,
-            LineStream::Tls(stream) => stream.read(space)?,
-        };
+        let read = self.stream.read(&mut self.buffer[self.filled..])?;
         ensure!(read > 0, "the connection was closed");
         self.filled += read;
         Ok(())
@@ -219,8 +208,7 @@ pub(crate) const TEXT: u8 = 1;
 /// Opcode of a binary frame.
 pub(crate) const BINARY: u8 = 2;
 
-/// Builds a frame of a WebSocket client. The mask is zero: the server has to remove it all the same, while the client
-/// need not apply it.
+/// Builds a frame of a WebSocket client, with a mask of zeros that the server has to remove all the same.
 pub(crate) fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
     let mut out = vec![0x80 | opcode];
     match payload.len() {

@@ -1,62 +1,32 @@
-//! The node `meter`: finds its servant, and exchanges publishing credit and message counts with it, bypassing the
-//! daemon.
+//! The node `meter` in its servant, with which publishing credit and message counts are exchanged past the daemon.
 
-use std::io;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use async_trait::async_trait;
 use bench_report::{BenchDaemon, first_child};
 use bytes::Bytes;
+use reach::ServantSockets;
 use ros::bus::{Bus, Publisher, QosProfile, WireType};
-use ros::net::Sockets;
 use ros::ros1::Ros1Bus;
-use ros::ros1::xmlrpc::{Value, XmlRpcClient};
+use ros::ros1::process::MASTER;
+use ros::ros1::xmlrpc::Value;
 use servant::launch::{self, RuntimeRecord};
 use servant::netns::NetNs;
-use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
 
 use crate::line::BenchConnection;
+use crate::raw::RawNode;
 
-/// Address of the Master in every servant.
-pub(crate) const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
 /// Timeout of everything that is waited for.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 const NODE: &str = "/meter";
 
-/// Sockets in the servant's network namespace.
-#[derive(Clone)]
-pub(crate) struct MeterSockets(Arc<NetNs>);
-
-impl MeterSockets {
-    /// Opens the network namespace of a process.
-    pub(crate) fn for_process(pid: i32) -> Result<Self> {
-        Ok(Self(Arc::new(NetNs::from_pid(pid)?)))
-    }
-}
-
-#[async_trait]
-impl Sockets for MeterSockets {
-    async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
-        self.0.connect(address).await
-    }
-
-    async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
-        self.0.listen(address).await
-    }
-}
-
-/// Returns the address of a node's XML-RPC server.
-pub(crate) async fn look_up_node(inside: &MeterSockets, name: &str) -> Result<String> {
-    let master = XmlRpcClient::new(Arc::new(inside.clone()), &format!("http://{MASTER}/"))?;
-    let found = master.call("lookupNode", &["/bench".into(), name.into()], PATIENCE).await?;
-    let found = found.as_array().context("an answer")?;
-    Ok(found.get(2).and_then(Value::as_str).with_context(|| format!("{name} in {found:?}"))?.to_owned())
+/// Opens the network namespace of a process.
+pub(crate) fn open_sockets(pid: i32) -> Result<ServantSockets> {
+    Ok(ServantSockets::new(&Arc::new(NetNs::from_pid(pid)?)))
 }
 
 /// The node under measurement.
@@ -64,7 +34,8 @@ pub(crate) struct MeterNode {
     /// PID 1 of its servant.
     pub(crate) pid: i32,
     pub(crate) runtime: Runtime,
-    slave: XmlRpcClient,
+    /// A node beside it, for bare connections.
+    pub(crate) raw: RawNode,
     bus: Arc<Ros1Bus>,
 }
 
@@ -78,13 +49,12 @@ impl MeterNode {
         let record: RuntimeRecord = launch::read_record(&path)?.context("its record")?;
         let pid = first_child(record.shim.pid)?;
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-        let inside = MeterSockets::for_process(pid)?;
-        let (bus, slave) = runtime.block_on(async {
+        let inside = open_sockets(pid)?;
+        let (bus, raw) = runtime.block_on(async {
             let bus = Ros1Bus::connect(Arc::new(inside.clone()), MASTER, "/bench_control").await?;
-            let slave = XmlRpcClient::new(Arc::new(inside.clone()), &look_up_node(&inside, NODE).await?)?;
-            anyhow::Ok((bus, slave))
+            anyhow::Ok((bus, RawNode::start(inside, NODE).await?))
         })?;
-        Ok(Self { pid, runtime, slave, bus })
+        Ok(Self { pid, runtime, raw, bus })
     }
 
     /// Waits until the node has `count` connections for a topic.
@@ -102,7 +72,7 @@ impl MeterNode {
 
     fn count_connections(&self, topic: &str) -> Result<usize> {
         let caller = ["/bench".into()];
-        let call = self.slave.call("getBusInfo", &caller, PATIENCE);
+        let call = self.raw.other.call("getBusInfo", &caller, PATIENCE);
         let answer = self.runtime.block_on(call)?;
         let rows = answer.as_array().and_then(|answer| answer.get(2)?.as_array());
         let about =
@@ -137,7 +107,7 @@ impl MeterNode {
             }
         });
         self.wait_until_connected(&topic, 1)?;
-        Ok(MessageCount { count })
+        Ok(MessageCount(count))
     }
 }
 
@@ -183,12 +153,10 @@ impl PublishCredit {
 }
 
 /// See [`MeterNode::message_count`].
-pub(crate) struct MessageCount {
-    count: Arc<AtomicU64>,
-}
+pub(crate) struct MessageCount(Arc<AtomicU64>);
 
 impl MessageCount {
     pub(crate) fn get(&self) -> u64 {
-        self.count.load(Ordering::Relaxed)
+        self.0.load(Ordering::Relaxed)
     }
 }

@@ -1,5 +1,4 @@
-//! Throughput in messages per second. A fixed window of messages is in flight, so that none is dropped and the slowest
-//! hop determines the rate.
+//! Throughput in messages per second, with a fixed window in flight, so that the slowest hop determines the rate.
 
 use std::time::{Duration, Instant};
 
@@ -9,6 +8,7 @@ use bench_report::{BenchDaemon, BenchReport, Process, Target, is_full_run};
 use crate::contestants::{ClientPath, Encoding, PathTarget, check_message};
 use crate::node::{MessageCount, MeterNode, PATIENCE, PublishCredit};
 use crate::relay::RelayHops;
+use crate::turns::take_turns;
 
 /// Duration of a turn; its first fifth is not counted.
 const TURN: Duration = Duration::from_millis(700);
@@ -20,82 +20,100 @@ const BIG: u64 = 4;
 const JSON: ClientPath = ClientPath::Daemon(Encoding::Json);
 const CBOR: ClientPath = ClientPath::Daemon(Encoding::Cbor);
 const RAW: ClientPath = ClientPath::Daemon(Encoding::Raw);
+/// Paths that every rate is compared with.
+const FLOORS: [ClientPath; 3] = [ClientPath::Direct, ClientPath::Bytes, ClientPath::Values];
 
-/// Throughput of rosbridge_suite (Python) on a comparable machine, per second; it kept one processor busy.
-const ROSBRIDGE: [(&str, ClientPath, f64); 6] = [
-    ("small messages out", JSON, 10_454.0),
-    ("small messages in", JSON, 8_181.0),
-    ("640x480 RGB out", JSON, 292.0),
-    ("640x480 RGB out", CBOR, 972.0),
-    ("640x480 RGB out", RAW, 788.0),
-    ("640x480 RGB in", JSON, 12.5),
-];
+/// A rate as a multiple of rosbridge_suite's.
+#[derive(Clone, Copy)]
+enum Multiple {
+    PerSecond(f64),
+    /// Per second of processor time, of which rosbridge_suite kept one processor busy.
+    PerProcessor(f64),
+}
 
-/// A required rate: as a fraction of the floor, or as a multiple of rosbridge_suite's (per second of processor time
-/// with `per_processor`).
-struct RateTarget {
+/// A path whose rate is measured, with its targets.
+struct RateGoal {
     way: ClientPath,
-    floor: ClientPath,
-    share: f64,
-    times_rosbridge: Option<f64>,
-    per_processor: bool,
+    floor: Option<(ClientPath, f64)>,
+    /// Throughput of rosbridge_suite (Python) on a comparable machine, per second.
+    suite: Option<f64>,
+    multiple: Option<Multiple>,
 }
 
-impl RateTarget {
-    fn share_of_floor(way: ClientPath, share: f64, floor: ClientPath) -> Self {
-        Self { way, floor, share, times_rosbridge: None, per_processor: false }
-    }
+/// Messages in one direction: a title, the topic, and the paths through the daemon.
+struct RateCase {
+    what: &'static str,
+    images: bool,
+    inward: Option<&'static str>,
+    outward: Option<&'static str>,
+    goals: &'static [RateGoal],
 }
+
+const fn goal(way: ClientPath, floor: ClientPath, share: f64, suite: f64) -> RateGoal {
+    RateGoal { way, floor: Some((floor, share)), suite: Some(suite), multiple: None }
+}
+
+const CASES: [RateCase; 4] = [
+    RateCase {
+        what: "small messages out",
+        images: false,
+        inward: None,
+        outward: Some("/meter/small_out"),
+        goals: &[RateGoal {
+            multiple: Some(Multiple::PerProcessor(10.0)),
+            ..goal(JSON, ClientPath::Direct, 0.7, 10_454.0)
+        }],
+    },
+    RateCase {
+        what: "small messages in",
+        images: false,
+        inward: Some("/meter/small_in"),
+        outward: None,
+        goals: &[RateGoal {
+            multiple: Some(Multiple::PerProcessor(10.0)),
+            ..goal(JSON, ClientPath::Direct, 0.7, 8_181.0)
+        }],
+    },
+    RateCase {
+        what: "640x480 RGB out",
+        images: true,
+        inward: None,
+        outward: Some("/meter/image_out"),
+        goals: &[
+            goal(JSON, ClientPath::Bytes, 0.2, 292.0),
+            goal(CBOR, ClientPath::Bytes, 0.5, 972.0),
+            goal(RAW, ClientPath::Bytes, 0.6, 788.0),
+        ],
+    },
+    RateCase {
+        what: "640x480 RGB in",
+        images: true,
+        inward: Some("/meter/image_in"),
+        outward: None,
+        goals: &[
+            RateGoal { multiple: Some(Multiple::PerSecond(25.0)), ..goal(JSON, ClientPath::Bytes, 0.2, 12.5) },
+            RateGoal { way: CBOR, floor: None, suite: None, multiple: None },
+            RateGoal { suite: None, ..goal(RAW, ClientPath::Bytes, 0.6, 0.0) },
+        ],
+    },
+];
 
 /// Measures all rates.
 pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, node: &MeterNode, only: &str) -> Result<()> {
-    let topic = |images, inward, outward| RelayHops { images, inward, outward, ..RelayHops::default() };
-    let tenfold = |share| RateTarget {
-        times_rosbridge: Some(10.0),
-        per_processor: true,
-        ..RateTarget::share_of_floor(JSON, share, ClientPath::Direct)
-    };
-    let many = RateTarget { times_rosbridge: Some(25.0), ..RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes) };
-    for (what, hops, ways, goals) in [
-        (
-            "small messages out",
-            topic(false, None, Some("/meter/small_out")),
-            vec![JSON, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
-            vec![tenfold(0.7)],
-        ),
-        (
-            "small messages in",
-            topic(false, Some("/meter/small_in"), None),
-            vec![JSON, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
-            vec![tenfold(0.7)],
-        ),
-        (
-            "640x480 RGB out",
-            topic(true, None, Some("/meter/image_out")),
-            vec![JSON, CBOR, RAW, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
-            vec![
-                RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes),
-                RateTarget::share_of_floor(CBOR, 0.5, ClientPath::Bytes),
-                RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes),
-            ],
-        ),
-        (
-            "640x480 RGB in",
-            topic(true, Some("/meter/image_in"), None),
-            vec![JSON, CBOR, RAW, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
-            vec![many, RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes)],
-        ),
-    ] {
-        if what.contains(only) {
-            let course = PathTarget { daemon, node, hops };
-            let found = measure_in_turns(&course, &ways, what)?;
-            report_rates(report, what, &ways, &found, &goals);
+    for case in CASES.iter().filter(|case| case.what.contains(only)) {
+        let RateCase { images, inward, outward, .. } = *case;
+        let course = PathTarget { daemon, node, hops: RelayHops { images, inward, outward, ..RelayHops::default() } };
+        let ways = case.goals.iter().map(|goal| goal.way).chain(FLOORS);
+        let mut found: Vec<_> = ways.map(|way| (way, MessageRate::default())).collect();
+        measure_in_turns(&course, &mut found, case.what)?;
+        for goal in case.goals {
+            report_rate(report, case.what, goal, &found);
         }
     }
     Ok(())
 }
 
-/// Messages per second, and messages per second of the daemon's processor time.
+/// Messages per second at best, and messages and the daemon's processor time in all turns.
 #[derive(Debug, Clone, Copy, Default)]
 struct MessageRate {
     best: f64,
@@ -103,30 +121,25 @@ struct MessageRate {
     processor: Duration,
 }
 
-fn measure_in_turns(course: &PathTarget<'_>, ways: &[ClientPath], what: &str) -> Result<Vec<MessageRate>> {
-    let rounds = if is_full_run() { 20 } else { 6 };
-    let mut found = vec![MessageRate::default(); ways.len()];
+fn measure_in_turns(course: &PathTarget<'_>, found: &mut [(ClientPath, MessageRate)], what: &str) -> Result<()> {
     let process = Process::from_pid(course.daemon.pid());
     // One for all turns, because it takes the node a while to connect and disconnect.
     let counter = match (course.hops.outward, course.hops.inward) {
         (Some(topic), _) => Counter::Credit(course.node.credit(topic)?),
         (None, topic) => Counter::Count(course.node.message_count(topic.unwrap_or_default())?),
     };
-    for round in 1..=rounds {
-        eprintln!("{what}: round {round} of {rounds}");
-        for (way, rate) in ways.iter().zip(&mut found) {
-            let before = process.total_processor_time()?;
-            let (per_second, messages) = match &counter {
-                Counter::Credit(credit) => measure_outward(course, *way, credit),
-                Counter::Count(count) => measure_inward(course, *way, count),
-            }
-            .with_context(|| format!("{what}, {way}"))?;
-            rate.best = rate.best.max(per_second);
-            rate.messages += messages;
-            rate.processor += process.total_processor_time()? - before;
-        }
-    }
-    Ok(found)
+    take_turns(what, if is_full_run() { 20 } else { 6 }, found, |(way, rate)| {
+        let before = process.total_processor_time()?;
+        let turn = match &counter {
+            Counter::Credit(credit) => measure_outward(course, *way, credit),
+            Counter::Count(count) => measure_inward(course, *way, count),
+        };
+        let (per_second, messages) = turn.with_context(|| format!("{what}, {way}"))?;
+        rate.best = rate.best.max(per_second);
+        rate.messages += messages;
+        rate.processor += process.total_processor_time()? - before;
+        Ok(())
+    })
 }
 
 /// Source of the flow control that keeps the window full.
@@ -238,42 +251,25 @@ fn wait_for_change(count: &MessageCount, before: u64) -> Result<u64> {
     }
 }
 
-fn report_rates(
-    report: &mut BenchReport,
-    what: &str,
-    ways: &[ClientPath],
-    found: &[MessageRate],
-    goals: &[RateTarget],
-) {
-    let rate = |way: ClientPath| {
-        let at = ways.iter().position(|other| *other == way);
-        at.map_or_else(MessageRate::default, |at| found[at])
-    };
-    for way in ways.iter().filter(|way| matches!(way, ClientPath::Daemon(_))) {
-        let ours = rate(*way);
-        let goal = goals.iter().find(|goal| goal.way == *way);
-        let name = format!("{what}, {way}");
-        for floor in ways.iter().filter(|way| !matches!(way, ClientPath::Daemon(_))) {
-            let figure = report.figure(name.clone(), "/s", ours.best);
-            figure.relative_to(floor.to_string(), rate(*floor).best);
-            if let Some(goal) = goal.filter(|goal| goal.floor == *floor) {
-                figure.require(Target::RatioAtLeast(goal.share));
-            }
+fn report_rate(report: &mut BenchReport, what: &str, goal: &RateGoal, found: &[(ClientPath, MessageRate)]) {
+    let rate =
+        |way: ClientPath| found.iter().find(|(other, _)| *other == way).map(|(_, rate)| *rate).unwrap_or_default();
+    let (ours, name) = (rate(goal.way), format!("{what}, {}", goal.way));
+    for floor in FLOORS {
+        let figure = report.figure(name.clone(), "/s", ours.best);
+        figure.relative_to(floor.to_string(), rate(floor).best);
+        if let Some((_, share)) = goal.floor.filter(|(of, _)| *of == floor) {
+            figure.require(Target::RatioAtLeast(share));
         }
-        let per_processor = ours.messages as f64 / ours.processor.as_secs_f64().max(0.01);
-        let mut per_second = format!("{name}, per s of the daemon's processor time");
-        let mut value = per_processor;
-        let suite = ROSBRIDGE.iter().find(|(title, encoding, _)| *title == what && encoding == way);
-        if goal.is_some_and(|goal| !goal.per_processor && goal.times_rosbridge.is_some()) {
-            report.figure(per_second, "/s", per_processor);
-            (per_second, value) = (name, ours.best);
-        }
-        let figure = report.figure(per_second, "/s", value);
-        if let Some((.., theirs)) = suite {
-            figure.relative_to("rosbridge_suite, elsewhere", *theirs);
-            if let Some(times) = goal.and_then(|goal| goal.times_rosbridge) {
-                figure.require(Target::RatioAtLeast(times));
-            }
-        }
+    }
+    let per_processor = ours.messages as f64 / ours.processor.as_secs_f64().max(0.01);
+    let mut figure = report.figure(format!("{name}, per s of the daemon's processor time"), "/s", per_processor);
+    if let Some(Multiple::PerSecond(_)) = goal.multiple {
+        figure = report.figure(name, "/s", ours.best);
+    }
+    let Some(suite) = goal.suite else { return };
+    figure.relative_to("rosbridge_suite, elsewhere", suite);
+    if let Some(Multiple::PerSecond(times) | Multiple::PerProcessor(times)) = goal.multiple {
+        figure.require(Target::RatioAtLeast(times));
     }
 }

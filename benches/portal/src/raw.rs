@@ -7,24 +7,29 @@ use std::sync::{Arc, Mutex, PoisonError};
 use anyhow::{Context, Result, ensure};
 use async_trait::async_trait;
 use bytes::BytesMut;
+use reach::ServantSockets;
 use ros::net::Sockets;
+use ros::ros1::process::MASTER;
 use ros::ros1::tcpros::Header;
 use ros::ros1::xmlrpc::{self, Fault, ServerLimits, Value, XmlRpcClient, XmlRpcHandler};
-use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
-use crate::node::{MASTER, MeterSockets, PATIENCE, TypeDescription, look_up_node};
+use crate::node::{PATIENCE, TypeDescription};
 
 /// Port of each topic that this node publishes.
 type Ports = Arc<Mutex<HashMap<String, u16>>>;
 
-/// A minimal ROS node.
+/// Name of this node.
+const NAME: &str = "/bench_direct";
+
+/// A minimal ROS node, which serves as long as its runtime.
 pub(crate) struct RawNode {
-    inside: MeterSockets,
-    name: String,
+    inside: ServantSockets,
+    master: XmlRpcClient,
+    /// The node with which it exchanges messages.
+    pub(crate) other: XmlRpcClient,
     uri: String,
     ports: Ports,
-    serving: JoinHandle<()>,
 }
 
 struct Slave(Ports);
@@ -45,33 +50,26 @@ impl XmlRpcHandler for Slave {
 }
 
 impl RawNode {
-    /// Starts a node `name` inside the servant.
-    pub(crate) async fn start(inside: MeterSockets, name: &str) -> Result<Self> {
+    /// Starts the node inside the servant, beside the node `other`.
+    pub(crate) async fn start(inside: ServantSockets, other: &str) -> Result<Self> {
         let listener = inside.listen("127.0.0.1:0".parse()?).await?;
-        let uri = format!("http://{}/", listener.local_addr()?);
-        let ports = Ports::default();
-        let handler = Arc::new(Slave(ports.clone()));
-        Ok(Self {
-            inside,
-            name: name.to_owned(),
-            uri,
-            ports,
-            serving: tokio::spawn(xmlrpc::serve(listener, handler, ServerLimits::default())),
-        })
+        let (uri, ports) = (format!("http://{}/", listener.local_addr()?), Ports::default());
+        tokio::spawn(xmlrpc::serve(listener, Arc::new(Slave(ports.clone())), ServerLimits::default()));
+        let client = |uri: &str| XmlRpcClient::new(Arc::new(inside.clone()), uri);
+        let master = client(&format!("http://{MASTER}/"))?;
+        let found = call(&master, "lookupNode", &[other.into()]).await?;
+        let other = client(found.as_str().context("an address")?)?;
+        Ok(Self { inside, master, other, uri, ports })
     }
 
-    /// Opens a connection that receives messages of a topic of the node.
+    /// Opens a connection that receives messages of a topic of the other node.
     pub(crate) async fn subscribe(&self, topic: &str, kind: TypeDescription) -> Result<TcpStream> {
-        let node = topic.rsplit_once('/').context("NODE/TOPIC")?.0;
-        let slave = look_up_node(&self.inside, node).await?;
-        let slave = XmlRpcClient::new(Arc::new(self.inside.clone()), &slave)?;
         let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
-        let arguments = [self.name.as_str().into(), topic.into(), protocols];
-        let answer = slave.call("requestTopic", &arguments, PATIENCE).await?;
-        let place = answer.as_array().and_then(|answer| answer.get(2)?.as_array());
-        let port = place.and_then(|place| place.get(2)?.as_int()).with_context(|| format!("{topic} in {answer:?}"))?;
+        let answer = call(&self.other, "requestTopic", &[topic.into(), protocols]).await?;
+        let port = answer.as_array().and_then(|place| place.get(2)?.as_int());
+        let port = port.with_context(|| format!("{topic} in {answer:?}"))?;
         let header = Header::new([
-            ("callerid", self.name.as_str()),
+            ("callerid", NAME),
             ("topic", topic),
             ("type", kind.name),
             ("md5sum", kind.md5),
@@ -82,11 +80,10 @@ impl RawNode {
 
     /// Opens a connection for calls of a service of the node.
     pub(crate) async fn connect_service(&self, service: &str) -> Result<TcpStream> {
-        let answer = self.call_master("lookupService", &[service.into()]).await?;
+        let answer = call(&self.master, "lookupService", &[service.into()]).await?;
         let uri = answer.as_str().context("an address")?;
         let port = uri.trim_end_matches('/').rsplit(':').next().context("a port")?;
-        let header =
-            Header::new([("callerid", self.name.as_str()), ("service", service), ("md5sum", "*"), ("persistent", "1")]);
+        let header = Header::new([("callerid", NAME), ("service", service), ("md5sum", "*"), ("persistent", "1")]);
         self.connect(port.parse()?, &header).await
     }
 
@@ -104,12 +101,12 @@ impl RawNode {
         let port = listener.local_addr()?.port();
         self.ports.lock().unwrap_or_else(PoisonError::into_inner).insert(topic.to_owned(), port);
         let registration = [topic.into(), kind.name.into(), self.uri.as_str().into()];
-        self.call_master("registerPublisher", &registration).await?;
+        call(&self.master, "registerPublisher", &registration).await?;
         let (mut stream, _) = timeout(PATIENCE, listener.accept()).await??;
         stream.set_nodelay(true)?;
         Header::read(&mut stream, &mut BytesMut::new()).await?;
         let answer = Header::new([
-            ("callerid", self.name.as_str()),
+            ("callerid", NAME),
             ("topic", topic),
             ("type", kind.name),
             ("md5sum", kind.md5),
@@ -123,24 +120,17 @@ impl RawNode {
     /// Unregisters a topic from the Master.
     pub(crate) async fn unpublish(&self, topic: &str) -> Result<()> {
         let arguments = [topic.into(), self.uri.as_str().into()];
-        self.call_master("unregisterPublisher", &arguments).await?;
+        call(&self.master, "unregisterPublisher", &arguments).await?;
         Ok(())
-    }
-
-    async fn call_master(&self, method: &str, arguments: &[Value]) -> Result<Value> {
-        let master = XmlRpcClient::new(Arc::new(self.inside.clone()), &format!("http://{MASTER}/"))?;
-        let arguments = [&[self.name.as_str().into()], arguments].concat();
-        let answer = master.call(method, &arguments, PATIENCE).await?;
-        let answer = answer.as_array().context("an answer")?;
-        ensure!(answer.first().and_then(Value::as_int) == Some(1), "{method}: {answer:?}");
-        Ok(answer.get(2).cloned().unwrap_or(Value::Int(0)))
     }
 }
 
-impl Drop for RawNode {
-    fn drop(&mut self) {
-        self.serving.abort();
-    }
+/// Calls a method and returns its value.
+async fn call(of: &XmlRpcClient, method: &str, arguments: &[Value]) -> Result<Value> {
+    let answer = of.call(method, &[&[NAME.into()], arguments].concat(), PATIENCE).await?;
+    let answer = answer.as_array().context("an answer")?;
+    ensure!(answer.first().and_then(Value::as_int) == Some(1), "{method}: {answer:?}");
+    Ok(answer.get(2).cloned().unwrap_or(Value::Int(0)))
 }
 
 fn into_blocking(stream: tokio::net::TcpStream) -> Result<TcpStream> {

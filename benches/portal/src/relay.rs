@@ -1,15 +1,16 @@
 //! A process between client and node, in the place of the daemon: it either copies bytes, or converts messages through
-//! `serde_json::Value`. It prints its address, serves one client and ends with it.
+//! `serde_json::Value`. Its connections are its standard streams: output to the client, input from the node, and errors
+//! to the node. It ends with its client.
 
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{Shutdown, TcpListener, TcpStream};
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::os::fd::{AsFd, OwnedFd};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
-use crate::node::{IMAGE, MeterSockets, PATIENCE, STRING};
-use crate::raw::RawNode;
+use crate::node::PATIENCE;
 use crate::value;
 
 /// Number of bytes that are copied at a time.
@@ -26,101 +27,66 @@ pub(crate) struct RelayHops<'a> {
     pub(crate) service: Option<&'a str>,
     /// True if the topics have the large type rather than the small one.
     pub(crate) images: bool,
-    /// True to convert through values, for a WebSocket.
-    pub(crate) values: bool,
 }
 
 /// A relay in a child process, which ends on drop.
-pub(crate) struct Relay {
-    child: Child,
-    /// Address for its client.
-    pub(crate) address: String,
-}
+pub(crate) struct Relay(Child);
 
 impl Relay {
-    pub(crate) fn start(pid: i32, hops: RelayHops<'_>) -> Result<Self> {
+    /// Starts a relay between these connections, and returns the client's end.
+    pub(crate) fn start(
+        values: bool,
+        hops: RelayHops<'_>,
+        from: Option<TcpStream>,
+        to: Option<TcpStream>,
+    ) -> Result<(Self, TcpStream)> {
+        let listener = TcpListener::bind("127.0.0.1:0")?;
+        let client = TcpStream::connect(listener.local_addr()?)?;
+        let (served, _) = listener.accept()?;
+        served.set_nodelay(true)?;
         let mut command = Command::new(std::env::current_exe()?);
-        command.arg("relay").arg(pid.to_string());
-        command.arg(if hops.values { "values" } else { "bytes" });
-        command.arg(if hops.images { "images" } else { "strings" });
-        for (flag, topic) in [("in", hops.inward), ("out", hops.outward), ("call", hops.service)] {
-            command.args(topic.map(|topic| format!("{flag}={topic}")));
-        }
-        let mut child = command.stdout(Stdio::piped()).spawn()?;
-        let mut address = String::new();
-        BufReader::new(child.stdout.take().context("piped")?).read_line(&mut address)?;
-        Ok(Self { child, address: address.trim().to_owned() })
+        command.args(["relay", if values { "values" } else { "bytes" }]);
+        command.args([if hops.images { "images" } else { "strings" }, hops.outward.unwrap_or_default()]);
+        command.args([from.is_some(), to.is_some()].map(|is_there| if is_there { "connected" } else { "none" }));
+        let stream = |stream: Option<TcpStream>| stream.map_or_else(Stdio::null, |stream| OwnedFd::from(stream).into());
+        let child = command.stdin(stream(from)).stdout(stream(Some(served))).stderr(stream(to)).spawn()?;
+        Ok((Self(child), client))
     }
 }
 
 impl Drop for Relay {
     fn drop(&mut self) {
-        // The process ends once its client has gone, after it has unregistered its topics.
         let patience = Instant::now() + PATIENCE;
-        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < patience {
+        while matches!(self.0.try_wait(), Ok(None)) && Instant::now() < patience {
             std::thread::sleep(Duration::from_millis(2));
         }
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 
 /// Runs the relay; called in the child process.
 pub(crate) fn run(words: &[&str]) -> Result<()> {
-    let [pid, how, messages, connections @ ..] = words else {
-        bail!("relay PID HOW MESSAGES [in=TOPIC] [out=TOPIC] [call=SERVICE]")
+    let [how, messages, topic, from, to] = words else {
+        bail!("relay HOW MESSAGES TOPIC FROM TO");
     };
-    let kind = if *messages == "images" { IMAGE } else { STRING };
-    let find = |flag: &str| {
-        let mut found = connections.iter().filter_map(|word| word.split_once('='));
-        found.find(|(name, _)| *name == flag).map(|(_, topic)| topic)
-    };
-    let (inward, outward, service) = (find("in"), find("out"), find("call"));
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-    let (inside, name) = (MeterSockets::for_process(pid.parse()?)?, format!("/relay_{}", std::process::id()));
-    let raw = runtime.block_on(RawNode::start(inside, &name))?;
-    let (mut there, mut back) = (None, None);
-    if let Some(service) = service {
-        let stream = runtime.block_on(raw.connect_service(service))?;
-        there = Some(stream.try_clone()?);
-        back = Some(stream);
+    let clone = |stream: &dyn AsFd| anyhow::Ok(TcpStream::from(stream.as_fd().try_clone_to_owned()?));
+    let client = clone(&std::io::stdout())?;
+    let from = (*from == "connected").then(|| clone(&std::io::stdin())).transpose()?;
+    let to = (*to == "connected").then(|| clone(&std::io::stderr())).transpose()?;
+    if *how == "values" {
+        return value::serve(client, to, from.map(|from| (*topic, from)), *messages == "images");
     }
-    if let Some(topic) = outward {
-        back = Some(runtime.block_on(raw.subscribe(topic, kind))?);
+    let mut reader = client.try_clone()?;
+    if let Some(from) = from {
+        // The thread ends with the process.
+        std::thread::spawn(move || pump(from, client));
     }
-    if let Some(topic) = inward {
-        there = Some(runtime.block_on(raw.publish(topic, kind))?);
-    }
-    let listener = TcpListener::bind("127.0.0.1:0")?;
-    println!("{}", listener.local_addr()?);
-    let (client, _) = listener.accept()?;
-    client.set_nodelay(true)?;
-    match *how {
-        "values" => value::serve(client, (inward, there), (outward, back), kind)?,
-        _ => relay_client(&client, there, back)?,
-    }
-    if let Some(topic) = inward {
-        runtime.block_on(raw.unpublish(topic))?;
-    }
-    Ok(())
-}
-
-fn relay_client(client: &TcpStream, there: Option<TcpStream>, back: Option<TcpStream>) -> Result<()> {
-    let (reader, writer) = (client.try_clone()?, client.try_clone()?);
-    let answering = back.map(|back| {
-        let kept = back.try_clone();
-        (kept, std::thread::spawn(move || pump(back, writer)))
-    });
-    match there {
-        Some(there) => pump(reader, there)?,
+    match to {
+        Some(to) => pump(reader, to).context("the client or the node is gone"),
         // The client sends nothing; wait until it disconnects.
-        None => drop({ reader }.read(&mut [0])?),
+        None => Ok(reader.read(&mut [0]).map(|_| ())?),
     }
-    if let Some((kept, thread)) = answering {
-        kept?.shutdown(Shutdown::Both)?;
-        let _ = thread.join();
-    }
-    Ok(())
 }
 
 fn pump(mut from: TcpStream, mut to: TcpStream) -> std::io::Result<()> {

@@ -1,5 +1,5 @@
-//! Cost of TLS and the policy: a second daemon with TLS, a robot's token and the default rules, measured in turns with
-//! the first daemon, which has neither. The client's encryption and decryption run on the same machine.
+//! Cost of TLS and the policy: a second daemon with TLS, a robot's token and the default rules, in turns with the
+//! first.
 
 use std::process::Command;
 
@@ -7,10 +7,11 @@ use anyhow::{Context, Result, ensure};
 use bench_report::{BenchDaemon, BenchReport, Target, is_full_run};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget, serialize_message};
-use crate::meter::{CONFIG, push_meter};
 use crate::node::MeterNode;
 use crate::relay::RelayHops;
+use crate::setup::{CONFIG, fixture_path, push_meter};
 use crate::tls::connect;
+use crate::turns::take_turns;
 use crate::{rates, trips};
 
 /// Limit for p50, as a multiple of the plain daemon's.
@@ -20,7 +21,7 @@ const PICTURES: &str = "640x480 RGB out, cbor-raw, TLS and policy";
 
 fn start_tls_daemon() -> Result<(BenchDaemon, MeterNode)> {
     let daemon = BenchDaemon::start(&format!("{CONFIG}[tls]\nserve = \"tls\"\n"))?;
-    push_meter(&daemon)?;
+    push_meter(&daemon, &fixture_path(), &[])?;
     let create = ["token", "create", "bench", "--role", "robot"];
     let rights = ["--robot", "bench", "--service", "meter"];
     let answer = daemon.deployer().run_json(&[&create[..], &rights].concat())?;
@@ -59,21 +60,14 @@ type DaemonPair<'a> = [(&'a BenchDaemon, &'a MeterNode); 2];
 
 fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
     let hops = RelayHops { inward: Some("/meter/ping"), outward: Some("/meter/pong"), ..RelayHops::default() };
-    let mut best = [[f64::MAX; 2]; 2];
-    let rounds = if is_full_run() { 30 } else { 10 };
-    for round in 1..=rounds {
-        eprintln!("{STRING}: round {round} of {rounds}");
-        for ((daemon, node), best) in ends.iter().zip(&mut best) {
-            let course = PathTarget { daemon, node, hops };
-            let found = trips::measure_turn(&course, ClientPath::Daemon(Encoding::Json))?;
-            for (best, found) in best.iter_mut().zip(found) {
-                *best = best.min(found.as_secs_f64() * 1e6);
-            }
-        }
-    }
+    let mut best = ends.map(|(daemon, node)| (PathTarget { daemon, node, hops }, [f64::INFINITY; 2]));
+    take_turns(STRING, if is_full_run() { 30 } else { 10 }, &mut best, |(course, best)| {
+        *best = trips::lower_of(*best, trips::measure_turn(course, ClientPath::Daemon(Encoding::Json))?);
+        Ok(())
+    })?;
     for (at, name) in ["p50", "p99"].iter().enumerate() {
-        let figure = report.figure(format!("{STRING}, {name}"), "µs", best[1][at]);
-        figure.relative_to("without both", best[0][at]);
+        let figure = report.figure(format!("{STRING}, {name}"), "µs", best[1].1[at]);
+        figure.relative_to("without both", best[0].1[at]);
         figure.note(format!("{suite}, at both ends"));
         if at == 0 {
             figure.require(Target::RatioAtMost(TIMES));
@@ -85,28 +79,24 @@ fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) ->
 fn measure_rate(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
     let topic = "/meter/image_out";
     let hops = RelayHops { images: true, outward: Some(topic), ..RelayHops::default() };
-    let credits = [ends[0].1.credit(topic)?, ends[1].1.credit(topic)?];
-    let mut best = [0.0_f64; 2];
-    let rounds = if is_full_run() { 20 } else { 6 };
-    let mut limit = 0.0_f64;
-    for round in 1..=rounds {
-        eprintln!("{PICTURES}: round {round} of {rounds}");
-        limit = limit.max(openssl_speed(suite)?);
-        for (((daemon, node), credit), best) in ends.iter().zip(&credits).zip(&mut best) {
-            let course = PathTarget { daemon, node, hops };
-            let (rate, _) = rates::measure_outward(&course, ClientPath::Daemon(Encoding::Raw), credit)?;
-            *best = best.max(rate);
-        }
+    let mut turns = Vec::new();
+    for (daemon, node) in ends {
+        turns.push((PathTarget { daemon, node, hops }, node.credit(topic)?, 0.0_f64));
     }
-    let figure = report.figure(PICTURES, "/s", best[1]);
-    figure.relative_to("without both", best[0]);
+    let mut limit = 0.0_f64;
+    take_turns(PICTURES, if is_full_run() { 20 } else { 6 }, &mut turns, |(course, credit, best)| {
+        limit = limit.max(openssl_speed(suite)?);
+        let (rate, _) = rates::measure_outward(course, ClientPath::Daemon(Encoding::Raw), credit)?;
+        *best = best.max(rate);
+        Ok(())
+    })?;
+    let (plain, secure) = (turns[0].2, turns[1].2);
+    report.figure(PICTURES, "/s", secure).relative_to("without both", plain);
     // Bytes are encrypted at one end and decrypted at the other.
     let ciphers = 2e6 * serialize_message(true).len() as f64 / limit;
-    let added = 1e6 / best[1] - 1e6 / best[0];
-    let figure = report.figure(format!("{PICTURES}, added to each"), "µs", added);
+    let figure = report.figure(format!("{PICTURES}, added to each"), "µs", 1e6 / secure - 1e6 / plain);
     figure.relative_to(format!("openssl speed, {}, twice", openssl_cipher(suite)), ciphers);
-    figure.note(format!("both ends are on this machine; {suite}"));
-    figure.require(Target::RatioAtMost(1.0));
+    figure.note(format!("both ends are on this machine; {suite}")).require(Target::RatioAtMost(1.0));
     Ok(())
 }
 

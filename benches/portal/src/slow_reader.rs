@@ -1,5 +1,4 @@
-//! A client that subscribes to images and never reads, while 100 MB of images are published per second: the effect on
-//! another client of the same servant, and on the daemon.
+//! A client that never reads while 100 MB of images are published per second: its effect on another and on the daemon.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -44,16 +43,11 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, node: &Met
     let grown = process.resident()? - before;
     drop(slow);
     for (at, name) in [(0, "p50"), (1, "p99")] {
-        let title = format!("a String beside a slow reader, {name}");
-        report
-            .figure(title, "µs", with[at])
-            .relative_to("beside one that reads", without[at])
-            .require(Target::RatioAtMost(1.5));
+        let figure = report.figure(format!("a String beside a slow reader, {name}"), "µs", with[at]);
+        figure.relative_to("beside one that reads", without[at]).require(Target::RatioAtMost(1.5));
     }
-    report
-        .figure("memory for a slow reader", "MB", grown)
-        .require(Target::AtMost(20.0))
-        .note(format!("{} s at 100 MB/s", time.as_secs()));
+    let figure = report.figure("memory for a slow reader", "MB", grown).require(Target::AtMost(20.0));
+    figure.note(format!("{} s at 100 MB/s", time.as_secs()));
     Ok(())
 }
 
@@ -70,8 +64,7 @@ fn drain(mut line: BenchConnection, reading: &AtomicBool) -> Result<()> {
     Ok(())
 }
 
-/// Returns p50 and p99 of the round trip of a String in µs, with one String every few milliseconds while images are
-/// published.
+/// Returns p50 and p99 in µs of Strings that go there and back while images are published.
 fn measure_under_load(course: &PathTarget<'_>, credit: &PublishCredit, time: Duration) -> Result<[f64; 2]> {
     let mut open = course.open(ClientPath::Daemon(Encoding::Json))?;
     let (begun, mut paid, mut times) = (Instant::now(), 0, Vec::new());

@@ -1,13 +1,14 @@
 //! Latency of messages and calls: round trips, one at a time.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::Result;
-use bench_report::{BenchDaemon, BenchReport, Target, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Target, is_full_run, quantile_seconds};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget};
 use crate::node::MeterNode;
 use crate::relay::RelayHops;
+use crate::turns::take_turns;
 
 /// Round trips per turn; the first tenth is not counted.
 const TRIPS: usize = 3000;
@@ -34,12 +35,16 @@ pub(crate) fn measure(
             continue;
         }
         let course = PathTarget { daemon, node, hops };
-        let found = measure_in_turns(&course, ways, what)?;
+        let mut best: Vec<_> = ways.iter().map(|way| (*way, [f64::INFINITY; 2])).collect();
+        take_turns(what, if is_full_run() { 30 } else { 10 }, &mut best, |(way, best)| {
+            *best = lower_of(*best, measure_turn(&course, *way)?);
+            Ok(())
+        })?;
+        let (_, ours) = best[0];
         for (at, name) in [(0, "p50"), (1, "p99")] {
-            let micros = |way: usize| found[way][at].as_secs_f64() * 1e6;
-            for (index, way) in ways.iter().enumerate().skip(1) {
-                let figure = report.figure(format!("{what}, {name}"), "µs", micros(0));
-                figure.relative_to(way.to_string(), micros(index));
+            for (way, theirs) in &best[1..] {
+                let figure = report.figure(format!("{what}, {name}"), "µs", ours[at]);
+                figure.relative_to(way.to_string(), theirs[at]);
                 if *way == ClientPath::Bytes && targets[at].is_finite() {
                     figure.require(Target::RatioAtMost(targets[at]));
                 }
@@ -49,8 +54,13 @@ pub(crate) fn measure(
     Ok(())
 }
 
-/// Returns p50 and p99 of one turn.
-pub(crate) fn measure_turn(course: &PathTarget<'_>, way: ClientPath) -> Result<[Duration; 2]> {
+/// Returns the lower of both medians, and of both late quantiles.
+pub(crate) fn lower_of(one: [f64; 2], other: [f64; 2]) -> [f64; 2] {
+    [one[0].min(other[0]), one[1].min(other[1])]
+}
+
+/// Returns p50 and p99 of one turn in microseconds.
+pub(crate) fn measure_turn(course: &PathTarget<'_>, way: ClientPath) -> Result<[f64; 2]> {
     let mut open = course.open(way)?;
     let mut times = Vec::with_capacity(TRIPS);
     for _ in 0..TRIPS {
@@ -60,22 +70,5 @@ pub(crate) fn measure_turn(course: &PathTarget<'_>, way: ClientPath) -> Result<[
         times.push(begun.elapsed());
     }
     course.close(open)?;
-    let counted = &mut times[TRIPS / 10..];
-    counted.sort_unstable();
-    Ok([50, 99].map(|part| counted[counted.len() * part / 100]))
-}
-
-/// Returns the best p50 and the best p99 of each path's turns.
-fn measure_in_turns(course: &PathTarget<'_>, ways: &[ClientPath], what: &str) -> Result<Vec<[Duration; 2]>> {
-    let rounds = if is_full_run() { 30 } else { 10 };
-    let mut best = vec![[Duration::MAX; 2]; ways.len()];
-    for round in 1..=rounds {
-        eprintln!("{what}: round {round} of {rounds}");
-        for (way, best) in ways.iter().zip(&mut best) {
-            for (best, found) in best.iter_mut().zip(measure_turn(course, *way)?) {
-                *best = (*best).min(found);
-            }
-        }
-    }
-    Ok(best)
+    Ok([0.5, 0.99].map(|share| quantile_seconds(&times[TRIPS / 10..], share) * 1e6))
 }

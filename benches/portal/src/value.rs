@@ -1,153 +1,116 @@
-//! The straightforward implementation: every message becomes a tree of `serde_json::Value` by walking the fields of its
-//! type, then text; and back. WebSockets are tungstenite's.
+//! The straightforward implementation: a tree of `serde_json::Value` for every message of the two measured types.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::sync::Arc;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result};
 use base64::prelude::{BASE64_STANDARD, Engine as _};
-use ros::schema::{Arity, Base, Field, MessageType, Primitive};
-use serde_json::{Map, Number, Value, json};
+use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::protocol::Role;
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
 
-use crate::node::TypeDescription;
-
-/// Serves one WebSocket client: forwards its publications to `there` and sends it what arrives on `back`.
+/// Serves a WebSocket client between a connection `there` and a topic's connection `back`.
 pub(crate) fn serve(
     client: TcpStream,
-    there: (Option<&str>, Option<TcpStream>),
-    back: (Option<&str>, Option<TcpStream>),
-    kind: TypeDescription,
+    there: Option<TcpStream>,
+    back: Option<(&str, TcpStream)>,
+    images: bool,
 ) -> Result<()> {
-    let kind = MessageType::from_full_text(kind.name, kind.definition)?;
     let writer = client.try_clone()?;
     let mut reader = tungstenite::accept(client).context("the client's handshake")?;
-    if let (Some(topic), Some(back)) = back {
-        let (topic, kind) = (topic.to_owned(), kind.clone());
+    if let Some((topic, back)) = back {
+        let topic = topic.to_owned();
         let socket = WebSocket::from_raw_socket(writer, Role::Server, None);
         // The thread ends with the process.
-        std::thread::spawn(move || forward_messages(back, socket, &topic, &kind));
+        std::thread::spawn(move || forward_messages(back, socket, &topic, images));
     }
-    let mut there = there.1;
+    let mut there = there;
     loop {
         let text = match reader.read() {
             Ok(Message::Text(text)) => text,
             Ok(_) => continue,
             Err(_) => return Ok(()),
         };
-        let mut op: Value = serde_json::from_str(&text)?;
+        let op: Value = serde_json::from_str(&text)?;
         if let Some(node) = there.as_mut().filter(|_| op["op"] == "publish") {
-            let mut message = Vec::new();
-            encode(&kind, op["msg"].take(), &mut message)?;
+            let message = encode(&op["msg"], images)?;
             node.write_all(&(message.len() as u32).to_le_bytes())?;
             node.write_all(&message)?;
         }
     }
 }
 
-fn forward_messages(
-    mut node: TcpStream,
-    mut socket: WebSocket<TcpStream>,
-    topic: &str,
-    kind: &Arc<MessageType>,
-) -> Result<()> {
+fn forward_messages(mut node: TcpStream, mut socket: WebSocket<TcpStream>, topic: &str, images: bool) -> Result<()> {
     let mut size = [0; 4];
     loop {
         node.read_exact(&mut size)?;
         let mut bytes = vec![0; u32::from_le_bytes(size) as usize];
         node.read_exact(&mut bytes)?;
-        let message = decode(kind, &mut bytes.as_slice())?;
+        let message = decode(&mut bytes.as_slice(), images)?;
         let op = json!({ "op": "publish", "topic": topic, "msg": message });
         socket.send(Message::text(op.to_string()))?;
     }
 }
 
-fn decode(kind: &MessageType, bytes: &mut &[u8]) -> Result<Value> {
-    let mut map = Map::new();
-    for field in kind.fields() {
-        map.insert(field.name.clone(), decode_field(field, bytes)?);
+/// Decodes a sensor_msgs/Image or a std_msgs/String.
+fn decode(bytes: &mut &[u8], images: bool) -> Result<Value> {
+    if !images {
+        return Ok(json!({ "data": decode_text(bytes)? }));
     }
-    Ok(Value::Object(map))
+    let stamp = |bytes: &mut &[u8]| anyhow::Ok(json!({ "secs": decode_u32(bytes)?, "nsecs": decode_u32(bytes)? }));
+    let header = json!({ "seq": decode_u32(bytes)?, "stamp": stamp(bytes)?, "frame_id": decode_text(bytes)? });
+    Ok(json!({
+        "header": header,
+        "height": decode_u32(bytes)?,
+        "width": decode_u32(bytes)?,
+        "encoding": decode_text(bytes)?,
+        "is_bigendian": take(bytes, 1)?[0],
+        "step": decode_u32(bytes)?,
+        "data": BASE64_STANDARD.encode(decode_bytes(bytes)?),
+    }))
 }
 
-fn decode_field(field: &Field, bytes: &mut &[u8]) -> Result<Value> {
-    let count = match field.arity {
-        Arity::One => return decode_one(&field.base, bytes),
-        Arity::Fixed(count) => count as usize,
-        Arity::Variable => u32::from_le_bytes(take(bytes)?) as usize,
+fn encode(message: &Value, images: bool) -> Result<Vec<u8>> {
+    let number = |value: &Value| anyhow::Ok(u32::try_from(value.as_u64().context("a number")?)?.to_le_bytes());
+    let text = |value: &Value| value.as_str().map(str::to_owned).context("a text");
+    let mut out = Vec::new();
+    let put = |out: &mut Vec<u8>, bytes: &[u8]| {
+        out.extend_from_slice(&(bytes.len() as u32).to_le_bytes());
+        out.extend_from_slice(bytes);
     };
-    if let Base::Primitive(Primitive::Uint8) = field.base {
-        return Ok(BASE64_STANDARD.encode(take_slice(bytes, count)?).into());
+    if !images {
+        put(&mut out, text(&message["data"])?.as_bytes());
+        return Ok(out);
     }
-    (0..count).map(|_| decode_one(&field.base, bytes)).collect()
-}
-
-fn decode_one(base: &Base, bytes: &mut &[u8]) -> Result<Value> {
-    Ok(match base {
-        Base::Message(kind) => decode(kind, bytes)?,
-        Base::Primitive(primitive) => match primitive {
-            Primitive::String => {
-                let length = u32::from_le_bytes(take(bytes)?) as usize;
-                String::from_utf8_lossy(take_slice(bytes, length)?).into()
-            }
-            Primitive::Uint8 => take::<1>(bytes)?[0].into(),
-            Primitive::Uint32 => u32::from_le_bytes(take(bytes)?).into(),
-            Primitive::Time => json!({
-                "secs": u32::from_le_bytes(take(bytes)?), "nsecs": u32::from_le_bytes(take(bytes)?),
-            }),
-            Primitive::Float64 => Number::from_f64(f64::from_le_bytes(take(bytes)?)).map_or(Value::Null, Value::Number),
-            other => bail!("{other:?} is not in the messages measured here"),
-        },
-    })
-}
-
-fn encode(kind: &MessageType, value: Value, out: &mut Vec<u8>) -> Result<()> {
-    let Value::Object(mut map) = value else { bail!("{} takes an object", kind.name()) };
-    for field in kind.fields() {
-        let value = map.remove(&field.name).unwrap_or_default();
-        match (&field.arity, &field.base) {
-            (Arity::One, base) => encode_one(base, value, out)?,
-            (_, Base::Primitive(Primitive::Uint8)) => {
-                let bytes = BASE64_STANDARD.decode(value.as_str().context("base64")?)?;
-                out.extend_from_slice(&(bytes.len() as u32).to_le_bytes());
-                out.extend_from_slice(&bytes);
-            }
-            _ => bail!("{} is not in the messages measured here", field.name),
-        }
+    let header = &message["header"];
+    for value in [&header["seq"], &header["stamp"]["secs"], &header["stamp"]["nsecs"]] {
+        out.extend_from_slice(&number(value)?);
     }
-    ensure!(map.is_empty(), "there is more in it");
-    Ok(())
+    put(&mut out, text(&header["frame_id"])?.as_bytes());
+    out.extend_from_slice(&number(&message["height"])?);
+    out.extend_from_slice(&number(&message["width"])?);
+    put(&mut out, text(&message["encoding"])?.as_bytes());
+    out.push(u8::try_from(message["is_bigendian"].as_u64().context("a number")?)?);
+    out.extend_from_slice(&number(&message["step"])?);
+    put(&mut out, &BASE64_STANDARD.decode(message["data"].as_str().context("base64")?)?);
+    Ok(out)
 }
 
-fn encode_one(base: &Base, value: Value, out: &mut Vec<u8>) -> Result<()> {
-    let number = |value: &Value| value.as_u64().context("a number");
-    match base {
-        Base::Message(kind) => encode(kind, value, out)?,
-        Base::Primitive(Primitive::String) => {
-            let text = value.as_str().context("a text")?;
-            out.extend_from_slice(&(text.len() as u32).to_le_bytes());
-            out.extend_from_slice(text.as_bytes());
-        }
-        Base::Primitive(Primitive::Uint8) => out.push(number(&value)?.try_into()?),
-        Base::Primitive(Primitive::Uint32) => out.extend_from_slice(&u32::try_from(number(&value)?)?.to_le_bytes()),
-        Base::Primitive(Primitive::Time) => {
-            for part in ["secs", "nsecs"] {
-                out.extend_from_slice(&u32::try_from(number(&value[part])?)?.to_le_bytes());
-            }
-        }
-        Base::Primitive(other) => bail!("{other:?} is not in the messages measured here"),
-    }
-    Ok(())
-}
-
-fn take<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N]> {
-    Ok(take_slice(bytes, N)?.try_into()?)
-}
-
-fn take_slice<'a>(bytes: &mut &'a [u8], count: usize) -> Result<&'a [u8]> {
+fn take<'a>(bytes: &mut &'a [u8], count: usize) -> Result<&'a [u8]> {
     let (taken, rest) = bytes.split_at_checked(count).context("it ends too early")?;
     *bytes = rest;
     Ok(taken)
+}
+
+fn decode_u32(bytes: &mut &[u8]) -> Result<u32> {
+    Ok(u32::from_le_bytes(take(bytes, 4)?.try_into()?))
+}
+
+fn decode_bytes<'a>(bytes: &mut &'a [u8]) -> Result<&'a [u8]> {
+    let length = decode_u32(bytes)? as usize;
+    take(bytes, length)
+}
+
+fn decode_text<'a>(bytes: &mut &'a [u8]) -> Result<&'a str> {
+    Ok(std::str::from_utf8(decode_bytes(bytes)?)?)
 }

@@ -17,8 +17,7 @@ pub(crate) fn copy_user_cache(place: &Path) -> Result<PathBuf> {
     Ok(cache)
 }
 
-/// Copies the base layer (with digest `base`) and the downloads from the cache `from` to the cache `to`, and nothing
-/// else.
+/// Copies the base layer, with this digest, and the downloads from one cache to another.
 pub(crate) fn copy_base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<()> {
     let (from, to) = (from.join("cloudroid"), to.join("cloudroid"));
     copy_tree(&from.join("apt"), &to.join("apt"))?;
@@ -37,8 +36,8 @@ pub(crate) fn copy_base_and_downloads(from: &Path, to: &Path, base: &str) -> Res
     Ok(())
 }
 
-/// Copies the tree below `from`, if it exists; layers, packages and lists of files, which are replaced and never
-/// modified, are hard-linked. Copies keep their modification times, which decide whether lists are up to date.
+/// Copies the tree below `from`, if it exists; files that are never modified are hard-linked. Copies keep their times,
+/// which decide whether lists are up to date.
 fn copy_tree(from: &Path, to: &Path) -> Result<()> {
     let Ok(entries) = fs::read_dir(from) else {
         return Ok(());

@@ -1,5 +1,4 @@
-//! `make bench ONLY=push`: cost of a push that shares something with an earlier one: a package with nearly the same
-//! dependencies, a workspace in which one package changed, an install space without changes. Needs root.
+//! `make bench ONLY=push`: cost of a push that shares something with an earlier one. Needs root.
 
 #![forbid(unsafe_code)]
 
@@ -85,12 +84,9 @@ fn measure(report: &mut BenchReport, daemon: &BenchDaemon, space: &Path, size: &
     let probe = median(&probes);
     let title = format!("{size}, again: layers made");
     report.figure(title, "layers", rebuilt as f64).require(Target::AtMost(0.0));
-    let title = format!("{size}, again: without the probe");
-    report
-        .figure(title, "s", median(&rests))
-        .relative_to("first push", (first.total - first_probe).as_secs_f64())
-        .require(Target::AtMost(BOUND))
-        .note(format!("median of {rounds}; the probe {probe:.2} s"));
+    let figure = report.figure(format!("{size}, again: without the probe"), "s", median(&rests));
+    figure.relative_to("first push", (first.total - first_probe).as_secs_f64()).require(Target::AtMost(BOUND));
+    figure.note(format!("median of {rounds}; the probe {probe:.2} s"));
     let title = format!("{size}, again: with the probe");
     report.figure(title, "s", median(&totals)).relative_to("first push", first.total.as_secs_f64());
     Ok(())

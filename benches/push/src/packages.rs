@@ -1,5 +1,4 @@
-//! Two packages of the distribution that share nearly all of their dependencies: cost of the second push compared with
-//! the first.
+//! Two packages of the distribution that share nearly all of their dependencies.
 
 use std::fs;
 use std::path::Path;
@@ -45,12 +44,10 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let [first, second] = costs[..] else {
         anyhow::bail!("two packages, and not {costs:?}");
     };
-    let title = "stereo_image_proc after image_proc: from the first step on, without the probe";
-    report
-        .figure(title, "s", second.0)
-        .relative_to("image_proc", first.0)
-        .require(Target::RatioAtMost(BOUND))
-        .note(format!("layers made: {} and {}", second.2, first.2));
+    let figure =
+        report.figure("stereo_image_proc after image_proc: from the first step on, without the probe", "s", second.0);
+    figure.relative_to("image_proc", first.0).require(Target::RatioAtMost(BOUND));
+    figure.note(format!("layers made: {} and {}", second.2, first.2));
     let title = "stereo_image_proc after image_proc: with the probe";
     report.figure(title, "s", second.1).relative_to("image_proc", first.1);
     Ok(())

@@ -1,5 +1,4 @@
-//! A workspace of three packages, each of which depends on the one before: cost of compiling all of them, one again,
-//! none again, and the rest after one of them failed.
+//! A workspace of three packages, each of which depends on the one before.
 
 use std::fs;
 use std::path::Path;
@@ -38,11 +37,8 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<
         Ok((pushed.total - probe).as_secs_f64())
     };
     for (name, pushed) in [("the last one fixed after it failed", &fixed), ("nothing changed", &unchanged)] {
-        let title = format!("workspace of three, {name}: without the probe");
-        report
-            .figure(title, "s", cost(pushed)?)
-            .relative_to("all changed", cost(&all)?)
-            .require(Target::RatioAtMost(BOUND));
+        let figure = report.figure(format!("workspace of three, {name}: without the probe"), "s", cost(pushed)?);
+        figure.relative_to("all changed", cost(&all)?).require(Target::RatioAtMost(BOUND));
     }
     eprintln!("pushing it with a mistake in the last CMakeLists.txt");
     let list = workspace.join("src/bench_app/CMakeLists.txt");
@@ -51,11 +47,12 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<
     fs::write(workspace.join("src/bench_lib/NOTE"), "changed again")?;
     let begun = std::time::Instant::now();
     ensure!(push_workspace(daemon, &workspace).is_err(), "a push that cannot be configured fails");
-    let title = "workspace of three: until a mistake in the last CMakeLists.txt is told";
-    report
-        .figure(title, "s", begun.elapsed().as_secs_f64())
-        .relative_to("all changed", cost(&all)?)
-        .require(Target::BelowFloor);
+    let figure = report.figure(
+        "workspace of three: until a mistake in the last CMakeLists.txt is told",
+        "s",
+        begun.elapsed().as_secs_f64(),
+    );
+    figure.relative_to("all changed", cost(&all)?).require(Target::BelowFloor);
     Ok(())
 }
 

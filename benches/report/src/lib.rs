@@ -1,23 +1,5 @@
-//! Common parts of all benchmarks: figures, each with the floor or peer measured in the same run and the required
-//! target; statistics, which the evaluation uses as well; resources of processes; and a daemon with pushes to it.
-//!
-//! ```text
-//! use bench_report::{BenchReport, Race, Target};
-//!
-//! # fn ours() {} fn theirs() {}
-//! let mut report = BenchReport::new("queue");
-//! let mut race = Race::new(20);
-//! race.add("ours", ours);
-//! race.add("theirs", theirs);
-//! let times = race.run();
-//! report
-//!     .figure("hand-over", "µs", times[0].best_micros())
-//!     .relative_to("theirs", times[1].best_micros())
-//!     .require(Target::RatioAtMost(1.0));
-//! report.finish().unwrap();
-//! ```
-//! Absolute numbers are specific to a machine, so the report contains a description of the machine; targets are best
-//! given as ratios.
+//! Common parts of all benchmarks: figures beside a floor or peer of the same run, statistics, processes, a daemon.
+//! Targets are best given as ratios, since absolute numbers are specific to a machine.
 
 #![forbid(unsafe_code)]
 
@@ -69,32 +51,22 @@ pub enum Target {
 }
 
 impl Target {
-    fn is_met(self, value: f64, floor: Option<f64>) -> bool {
+    /// Returns the target in words, and whether it was met.
+    fn judge(self, value: f64, floor: Option<f64>) -> (String, bool) {
         let floor = floor.unwrap_or(f64::NAN);
         match self {
-            Self::AtLeast(bound) => value >= bound,
-            Self::AtMost(bound) => value <= bound,
-            Self::RatioAtLeast(bound) => value / floor >= bound,
-            Self::RatioAtMost(bound) => value / floor <= bound,
-            Self::AboveFloor => value > floor,
-            Self::BelowFloor => value < floor,
-        }
-    }
-
-    fn describe(self) -> String {
-        match self {
-            Self::AtLeast(bound) => format!("≥ {bound}"),
-            Self::AtMost(bound) => format!("≤ {bound}"),
-            Self::RatioAtLeast(bound) => format!("≥ {bound}x"),
-            Self::RatioAtMost(bound) => format!("≤ {bound}x"),
-            Self::AboveFloor => "> floor".to_owned(),
-            Self::BelowFloor => "< floor".to_owned(),
+            Self::AtLeast(bound) => (format!("≥ {bound}"), value >= bound),
+            Self::AtMost(bound) => (format!("≤ {bound}"), value <= bound),
+            Self::RatioAtLeast(bound) => (format!("≥ {bound}x"), value / floor >= bound),
+            Self::RatioAtMost(bound) => (format!("≤ {bound}x"), value / floor <= bound),
+            Self::AboveFloor => ("> floor".to_owned(), value > floor),
+            Self::BelowFloor => ("< floor".to_owned(), value < floor),
         }
     }
 }
 
 /// One measured number.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Figure {
     /// Name of the figure.
     pub figure: String,
@@ -132,8 +104,8 @@ impl Figure {
 
     /// Sets the target; call it after [`Figure::relative_to`].
     pub fn require(&mut self, target: Target) -> &mut Self {
-        self.to_reach = Some(target.describe());
-        self.met = Some(target.is_met(self.value, self.floor));
+        let (to_reach, met) = target.judge(self.value, self.floor);
+        (self.to_reach, self.met) = (Some(to_reach), Some(met));
         self
     }
 
@@ -179,17 +151,7 @@ impl BenchReport {
 
     /// Adds a figure.
     pub fn figure(&mut self, name: impl Into<String>, unit: &str, value: f64) -> &mut Figure {
-        self.figures.push(Figure {
-            figure: name.into(),
-            unit: unit.to_owned(),
-            value,
-            peer: None,
-            floor: None,
-            ratio: None,
-            to_reach: None,
-            met: None,
-            note: None,
-        });
+        self.figures.push(Figure { figure: name.into(), unit: unit.to_owned(), value, ..Figure::default() });
         let last = self.figures.len() - 1;
         &mut self.figures[last]
     }
@@ -207,9 +169,7 @@ impl BenchReport {
         let directory = root().join("target/bench");
         std::fs::create_dir_all(&directory)?;
         let path = directory.join(format!("{}.json", self.bench));
-        let mut text = serde_json::to_string_pretty(self)?;
-        text.push('\n');
-        std::fs::write(&path, text)?;
+        std::fs::write(&path, serde_json::to_string_pretty(self)? + "\n")?;
         println!("written to {}", path.display());
         Ok(path)
     }
@@ -231,33 +191,21 @@ mod tests {
         report.figure("speed", "MB/s", 30.0).relative_to("peer", 100.0).require(Target::RatioAtLeast(0.3));
         report.figure("size", "B", 120.0).relative_to("peer", 100.0).require(Target::RatioAtMost(1.2));
         report.figure("saved", "%", 50.0).require(Target::AtMost(40.0));
-        assert_eq!(
-            report.figures.iter().map(|figure| figure.met).collect::<Vec<_>>(),
-            [Some(true), Some(true), Some(false)]
-        );
+        report.figure("a ratio without its floor", "MB/s", 30.0).require(Target::RatioAtLeast(0.3));
+        let met: Vec<_> = report.figures.iter().map(|figure| figure.met).collect();
+        assert_eq!(met, [Some(true), Some(true), Some(false), Some(false)]);
         assert_eq!(report.figures[0].ratio, Some(0.3));
     }
 
     #[test]
-    fn a_target_without_its_floor_is_not_met() {
-        let mut report = BenchReport::new("test");
-        report.figure("speed", "MB/s", 30.0).require(Target::RatioAtLeast(0.3));
-        assert_eq!(report.figures[0].met, Some(false));
-    }
-
-    #[test]
-    fn the_table_shows_every_figure() {
+    fn figures_and_what_is_left_out_are_in_table_and_file() {
         let mut report = BenchReport::new("test");
         report.figure("speed", "MB/s", 30.0).relative_to("peer", 100.0).require(Target::AboveFloor).note("cold");
-        let table = table::render(&report);
-        assert!(table.contains("speed") && table.contains("NOT MET") && table.contains("cold"), "{table}");
-    }
-
-    #[test]
-    fn what_is_left_out_is_in_table_and_file() {
-        let mut report = BenchReport::new("test");
         report.skip("a peer", "it is not installed");
-        assert!(table::render(&report).contains("a peer is left out: it is not installed"));
+        let table = table::render(&report);
+        for words in ["speed", "NOT MET", "cold", "a peer is left out: it is not installed"] {
+            assert!(table.contains(words), "{table}");
+        }
         let text = serde_json::to_string(&report).expect("JSON");
         assert!(text.contains(r#""left_out":[{"what":"a peer","why":"it is not installed"}]"#), "{text}");
     }

@@ -12,10 +12,7 @@ pub fn is_full_run() -> bool {
     std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| !value.is_empty() && value != "0")
 }
 
-/// Measures the parts that the program's arguments name, or all without arguments, and writes the report `name`.
-///
-/// # Errors
-/// If an argument names no part, or if a part fails; the figures that were measured are reported all the same.
+/// Measures the parts that the program's arguments name, or all, and writes the report `name`; fails if a part did.
 pub fn run_parts(name: &str, parts: &[Part]) -> Result<()> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     for word in &words {

@@ -104,8 +104,8 @@ pub fn children_processor_time() -> Duration {
     sum_ticks(&text, 16).unwrap_or_default()
 }
 
-/// Sums two adjacent fields of `/proc/PID/stat` in hundredths of a second, the first of which has this number: 14 and
-/// 15 are utime and stime, 16 and 17 those of children (proc(5)). They follow the name, which may contain anything.
+/// Sums two adjacent fields of `/proc/PID/stat` in hundredths of a second: 14 and 15 are utime and stime, 16 and 17
+/// those of children (proc(5)). They follow the name, which may contain anything.
 fn sum_ticks(stat: &str, first: usize) -> Option<Duration> {
     let (_, fields) = stat.rsplit_once(')')?;
     let mut fields = fields.split_whitespace().skip(first - 3);

@@ -62,8 +62,7 @@ impl TimedPush {
         Ok(made.map(|layer| layer["name"].as_str().unwrap_or_default().to_owned()).collect())
     }
 
-    /// Returns the time until the first step of the build began: before, the daemon receives what is pushed, and opens
-    /// the archive's index and the base, once.
+    /// Returns the time until the first step of the build, in which the daemon receives and opens what it needs.
     pub fn time_to_first_step(&self) -> Duration {
         let prepares = |event: &Value| {
             let title = event["title"].as_str().unwrap_or_default();
@@ -73,14 +72,12 @@ impl TimedPush {
         first.map_or(Duration::ZERO, |(time, _)| *time)
     }
 
-    /// Returns the total time of the steps whose titles start with `title`; a step lasts until the next one, or until
-    /// the end.
+    /// Returns the total time of the steps whose titles start with `title`; a step lasts until the next one.
     pub fn step_duration(&self, title: &str) -> Option<Duration> {
         let ends = |event: &Value| event["type"] == "step" || event["type"] == "done";
         let marks: Vec<_> = self.events.iter().filter(|(_, event)| ends(event)).collect();
-        let spans =
-            marks.windows(2).filter(|pair| pair[0].1["title"].as_str().is_some_and(|found| found.starts_with(title)));
-        let spans: Vec<Duration> = spans.map(|pair| pair[1].0 - pair[0].0).collect();
-        (!spans.is_empty()).then(|| spans.iter().sum())
+        let is_named = |event: &Value| event["title"].as_str().is_some_and(|found| found.starts_with(title));
+        let spans = marks.windows(2).filter(|pair| is_named(&pair[0].1)).map(|pair| pair[1].0 - pair[0].0);
+        spans.reduce(|sum, span| sum + span)
     }
 }

@@ -1,13 +1,11 @@
-//! A prebuilt install space: one launch file that starts `relay /in /out`, a roscpp node that registers at once and
-//! then waits.
+//! A prebuilt install space whose launch file starts `relay /in /out`, a roscpp node that registers at once.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-/// Writes the install space of `package` in `place`. The node is `executable`, which is copied into the space, or that
-/// of `topic_tools`.
+/// Writes the install space of `package` in `place`, with this node or that of `topic_tools`.
 pub fn write_install_space(place: &Path, package: &str, executable: Option<&Path>) -> Result<PathBuf> {
     let space = place.join(package);
     let share = space.join("share").join(package);

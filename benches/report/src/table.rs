@@ -1,6 +1,6 @@
 //! The table that is printed for readers.
 
-use crate::{BenchReport, Figure};
+use crate::{BenchReport, Figure, MachineDescription};
 use std::fmt::Write as _;
 
 /// Formats with three digits, or all digits before the point.
@@ -12,50 +12,29 @@ pub fn format_number(value: f64) -> String {
     }
 }
 
-/// Formats the value of a figure; percentages get two decimals, because those near a hundred differ only there.
-fn format_value(figure: &Figure) -> String {
-    if figure.unit == "%" { format!("{:.2}", figure.value) } else { format_number(figure.value) }
-}
-
-fn verdict(figure: &Figure) -> &'static str {
-    match figure.met {
-        Some(true) => "met",
-        Some(false) => "NOT MET",
-        None => "",
-    }
+/// Returns the cells of a figure's row; percentages get two decimals, because those near a hundred differ only there.
+fn cells(figure: &Figure) -> [String; 7] {
+    let Figure { value, unit, .. } = figure;
+    let value = if unit == "%" { format!("{value:.2}") } else { format_number(*value) };
+    let beside = figure.floor.zip(figure.peer.as_ref());
+    [
+        figure.figure.clone(),
+        format!("{value} {unit}"),
+        beside.map(|(floor, peer)| format!("{} {peer}", format_number(floor))).unwrap_or_default(),
+        figure.ratio.map(|ratio| format!("{ratio:.2}x")).unwrap_or_default(),
+        figure.to_reach.clone().unwrap_or_default(),
+        figure.met.map_or("", |met| if met { "met" } else { "NOT MET" }).to_owned(),
+        figure.note.clone().unwrap_or_default(),
+    ]
 }
 
 pub(crate) fn render(report: &BenchReport) -> String {
-    let machine = &report.machine;
+    let MachineDescription { processor, processors, memory_gib, kernel, system, load } = &report.machine;
     let mut text = format!(
-        "{}: {} × {}, {} GiB, {}, Linux {}, load {}\n",
-        report.bench,
-        machine.processors,
-        machine.processor,
-        machine.memory_gib,
-        machine.system,
-        machine.kernel,
-        machine.load
+        "{}: {processors} × {processor}, {memory_gib} GiB, {system}, Linux {kernel}, load {load}\n",
+        report.bench
     );
-    let rows: Vec<[String; 7]> = report
-        .figures
-        .iter()
-        .map(|figure| {
-            let floor = match (figure.floor, &figure.peer) {
-                (Some(floor), Some(peer)) => format!("{} {peer}", format_number(floor)),
-                _ => String::new(),
-            };
-            [
-                figure.figure.clone(),
-                format!("{} {}", format_value(figure), figure.unit),
-                floor,
-                figure.ratio.map(|ratio| format!("{ratio:.2}x")).unwrap_or_default(),
-                figure.to_reach.clone().unwrap_or_default(),
-                verdict(figure).to_owned(),
-                figure.note.clone().unwrap_or_default(),
-            ]
-        })
-        .collect();
+    let rows: Vec<[String; 7]> = report.figures.iter().map(cells).collect();
     let titles = ["figure", "value", "beside", "ratio", "to reach", "", ""].map(str::to_owned);
     let width = |column: usize| rows.iter().chain([&titles]).map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: [usize; 7] = std::array::from_fn(width);

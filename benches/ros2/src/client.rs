@@ -1,5 +1,4 @@
-//! A rosbridge client in the same network as the server under measurement: `bench-ros2 inside client ROLE …`. It does
-//! little besides waiting, and the same for every server.
+//! A rosbridge client in the server's network: `bench-ros2 inside client ROLE …`, the same for every server.
 
 use std::io::ErrorKind;
 use std::net::TcpStream;
@@ -12,20 +11,18 @@ use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{self, Error, Message, WebSocket};
 
-use crate::camera::{self, FrameStatistics, RATE};
-use crate::measuring::{WARM, print_json, quantiles};
-use crate::message::{self, Size, TEXT};
+use crate::bus::LONG;
+use crate::echoes;
+use crate::exchanges::{print_json, print_ready, time_blocking};
+use crate::messages::{self, Size, TEXT};
+use crate::pictures::{FrameStatistics, RATE, SETTLED};
 use crate::portal::ADDRESS;
-use crate::types;
 
-/// Maximum time for a server to start and to discover nodes.
-const LONG: Duration = Duration::from_secs(15);
 /// Time after which an answer counts as missing.
-const PATIENCE: Duration = Duration::from_secs(5);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(5);
 /// Interval at which a message is repeated until it is answered.
-const AGAIN: Duration = Duration::from_millis(20);
-/// Time that the first call or goal has for its server to be discovered before another one is sent, under another id:
-/// servers refuse a goal whose id is in use.
+pub(crate) const AGAIN: Duration = Duration::from_millis(20);
+/// Time for a server to be discovered before another first call is sent, under another id.
 const FIRST: Duration = Duration::from_secs(1);
 /// Limit of a message: more than an image of 6 MB with its envelope.
 const LARGEST: usize = 32 << 20;
@@ -37,6 +34,7 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
         ["calls", count] => time_calls(count.parse()?),
         ["goals", count] => time_goals(count.parse()?),
         ["joins"] => time_join(),
+        ["echoes", rest @ ..] => echoes::run(rest),
         ["sends", width, height, frames, reliable] => {
             let (width, height) = (width.parse()?, height.parse()?);
             send_pictures(Size { width, height }, frames.parse()?, reliable)
@@ -47,11 +45,11 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
 }
 
 /// A connection to the server.
-struct BenchClient(WebSocket<TcpStream>);
+pub(crate) struct BenchClient(WebSocket<TcpStream>);
 
 impl BenchClient {
     /// Connects as soon as the server listens.
-    fn connect() -> Result<Self> {
+    pub(crate) fn connect() -> Result<Self> {
         let limit = Instant::now() + LONG;
         let stream = loop {
             match TcpStream::connect(ADDRESS) {
@@ -72,16 +70,16 @@ impl BenchClient {
         }
     }
 
-    fn send_op(&mut self, op: &Value) -> Result<()> {
+    pub(crate) fn send_op(&mut self, op: &Value) -> Result<()> {
         self.send(Message::text(op.to_string()))
     }
 
-    fn send(&mut self, message: Message) -> Result<()> {
+    pub(crate) fn send(&mut self, message: Message) -> Result<()> {
         self.0.send(message).context("the connection is gone")
     }
 
     /// Returns the next message, or `None` if none arrives in time.
-    fn receive(&mut self, patience: Duration) -> Result<Option<Message>> {
+    pub(crate) fn receive(&mut self, patience: Duration) -> Result<Option<Message>> {
         self.0.get_ref().set_read_timeout(Some(patience))?;
         loop {
             match self.0.read() {
@@ -109,7 +107,7 @@ impl BenchClient {
     }
 
     /// Sends what `op` returns for each attempt until `wanted` accepts a message.
-    fn repeat_until(
+    pub(crate) fn repeat_until(
         &mut self,
         op: impl Fn(usize) -> Value,
         patience: Duration,
@@ -140,23 +138,18 @@ impl BenchClient {
 }
 
 fn qos_json(reliable: &str) -> Value {
-    let reliability = match reliable {
-        "1" => "reliable",
-        _ => "best_effort",
-    };
+    let reliability = if reliable == "1" { "reliable" } else { "best_effort" };
     json!({"reliability": reliability, "history": "keep_last", "depth": 5})
 }
 
-/// Sends what `op` returns for each number and waits for a text that contains the words which `op` returns with it;
-/// `answer` must accept that text. Makes `count` such exchanges, one at a time.
+/// Makes `count` exchanges: sends an op and waits for a text with its words, which `answer` must accept.
 fn time_exchanges(
     client: &mut BenchClient,
     count: usize,
     op: impl Fn(usize) -> (Value, String),
     answer: impl Fn(&Value) -> bool,
-) -> Result<Vec<Duration>> {
-    let mut times = Vec::with_capacity(count);
-    for number in 0..count + WARM {
+) -> Result<()> {
+    time_blocking(count, |number| {
         let (op, words) = op(number);
         let message = Message::text(op.to_string());
         let begun = Instant::now();
@@ -166,72 +159,58 @@ fn time_exchanges(
         let text = text.with_context(|| format!("no answer to {op}"))?;
         // The text could also be a status that says why there is no answer.
         ensure!(answer(&serde_json::from_str(&text)?), "{op} brings {text}");
-        if number >= WARM {
-            times.push(took);
-        }
-    }
-    Ok(times)
+        Ok(took)
+    })
 }
 
 /// Measures round trips of Strings, one at a time.
 fn time_trips(count: usize) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    client.send_op(&json!({"op": "subscribe", "topic": "/pong", "type": types::STRING}))?;
-    client.send_op(&json!({"op": "advertise", "topic": "/ping", "type": types::STRING}))?;
+    client.send_op(&json!({"op": "subscribe", "topic": "/pong", "type": messages::STRING}))?;
+    client.send_op(&json!({"op": "advertise", "topic": "/ping", "type": messages::STRING}))?;
     let publish = |text: &str| json!({"op": "publish", "topic": "/ping", "msg": {"data": text}});
     client.repeat_until(|_| publish("first"), AGAIN, |heard| heard["msg"]["data"] == "first")?;
-    print_json(&json!({}));
     let op = |number| {
         let text = format!("{TEXT}, {number}");
         (publish(&text), format!("{text}\""))
     };
-    let times = time_exchanges(&mut client, count, op, |heard| heard["topic"] == "/pong")?;
-    print_json(&quantiles(&times));
-    Ok(())
+    time_exchanges(&mut client, count, op, |heard| heard["topic"] == "/pong")
 }
 
-/// Measures calls, one at a time.
-fn time_calls(count: usize) -> Result<()> {
+/// Measures requests with an id, one at a time.
+fn time_requests(count: usize, request: impl Fn(&str) -> Value, answer: impl Fn(&Value) -> bool) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    let call = |id: &str| {
-        json!({"op": "call_service", "id": id, "service": "/setbool", "type": types::CALL,
-        "args": {"data": true}})
-    };
-    let answer = |heard: &Value| heard["values"]["success"] == true;
-    client.repeat_until(|attempt| call(&format!("first-{attempt}")), FIRST, answer)?;
-    print_json(&json!({}));
+    client.repeat_until(|attempt| request(&format!("first-{attempt}")), FIRST, &answer)?;
     let op = |number| {
-        let id = format!("call-{number}");
-        (call(&id), format!("\"{id}\""))
+        let id = format!("request-{number}");
+        (request(&id), format!("\"{id}\""))
     };
-    print_json(&quantiles(&time_exchanges(&mut client, count, op, answer)?));
-    Ok(())
+    time_exchanges(&mut client, count, op, answer)
 }
 
-/// Measures goals from sending to result, one at a time.
+fn time_calls(count: usize) -> Result<()> {
+    let call = |id: &str| {
+        json!({"op": "call_service", "id": id, "service": "/setbool", "type": messages::CALL,
+            "args": {"data": true}})
+    };
+    time_requests(count, call, |heard| heard["values"]["success"] == true)
+}
+
+/// Measures goals from sending to result.
 fn time_goals(count: usize) -> Result<()> {
-    let mut client = BenchClient::connect()?;
     let goal = |id: &str| {
-        json!({"op": "send_action_goal", "id": id, "action": "/fibonacci", "action_type": types::GOAL,
+        json!({"op": "send_action_goal", "id": id, "action": "/fibonacci", "action_type": messages::GOAL,
             "args": {"order": 2}, "feedback": false})
     };
-    let answer = |heard: &Value| heard["values"]["sequence"] == json!([0, 1]);
-    client.repeat_until(|attempt| goal(&format!("first-{attempt}")), FIRST, answer)?;
-    print_json(&json!({}));
-    let op = |number| {
-        let id = format!("goal-{number}");
-        (goal(&id), format!("\"{id}\""))
-    };
-    print_json(&quantiles(&time_exchanges(&mut client, count, op, answer)?));
-    Ok(())
+    time_requests(count, goal, |heard| heard["values"]["sequence"] == json!([0, 1]))
 }
 
 /// Measures from connecting to the first message of a running node.
 fn time_join() -> Result<()> {
-    print_json(&json!({}));
+    print_ready();
     let begun = Instant::now();
     let mut client = BenchClient::connect()?;
-    client.send_op(&json!({"op": "subscribe", "topic": "/beat", "type": types::STRING}))?;
+    client.send_op(&json!({"op": "subscribe", "topic": "/beat", "type": messages::STRING}))?;
     let beat = client.receive_text_with("/beat", LONG)?;
     let took = begun.elapsed().as_secs_f64() * 1e3;
     beat.context("no beat")?;
@@ -239,19 +218,19 @@ fn time_join() -> Result<()> {
     Ok(())
 }
 
-/// Sends images as soon as there is a subscriber, and counts how many were late. The resources of this process are not
-/// reported, because a robot is not part of the server.
+/// Sends images as soon as there is a subscriber, and counts how many were late.
 fn send_pictures(size: Size, frames: u32, reliable: &str) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    client
-        .send_op(&json!({"op": "advertise", "topic": "/pictures", "type": types::IMAGE, "qos": qos_json(reliable)}))?;
-    print_json(&json!({}));
+    client.send_op(
+        &json!({"op": "advertise", "topic": "/pictures", "type": messages::IMAGE, "qos": qos_json(reliable)}),
+    )?;
+    print_ready();
     let asks = json!({"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": "/pictures"}});
     client.repeat_until(|_| asks.clone(), AGAIN, |heard| heard["values"]["subscribers"][0].is_string())?;
-    std::thread::sleep(camera::SETTLED);
+    std::thread::sleep(SETTLED);
     let (mut due, mut late) = (Instant::now(), 0);
     for number in 0..frames {
-        client.send(Message::binary(encode_picture(&message::picture(number, size))))?;
+        client.send(Message::binary(encode_picture(&messages::picture(number, size))))?;
         due += Duration::from_secs_f64(1.0 / RATE);
         let now = Instant::now();
         late += u32::from(now > due);
@@ -279,12 +258,12 @@ fn encode_picture(picture: &[u8]) -> Vec<u8> {
 /// Receives images; prints what was received when asked.
 fn receive_pictures(reliable: &str) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    client.send_op(&json!({"op": "subscribe", "topic": "/pictures", "type": types::IMAGE,
+    client.send_op(&json!({"op": "subscribe", "topic": "/pictures", "type": messages::IMAGE,
         "compression": "cbor-raw", "qos": qos_json(reliable)}))?;
     // Once the server answers this call, it has processed the subscription.
     let asks = json!({"op": "call_service", "service": "/rosapi/get_time"});
     client.repeat_until(|_| asks.clone(), AGAIN, |heard| heard["result"] == true)?;
-    print_json(&json!({}));
+    print_ready();
     let seen = Arc::new(Mutex::new(FrameStatistics::default()));
     let watched = seen.clone();
     std::thread::spawn(move || {

@@ -51,7 +51,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let world = BenchNetwork::new()?;
     let _node = world.start_rclpy(Transport::Udp, &["relay", BEATS])?;
     let newcomers = [Newcomer::Ours, Newcomer::Robot, Newcomer::AnotherRobot, Newcomer::Rclpy];
-    let mut found = vec![(Vec::new(), Vec::new()); newcomers.len()];
+    let mut found = newcomers.map(|_| (Vec::new(), Vec::new()));
     for _ in 0..rounds {
         for (newcomer, (beats, pongs)) in newcomers.iter().zip(&mut found) {
             let (beat, pong) = newcomer.time_join(&world)?;
@@ -59,29 +59,18 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
             pongs.extend(pong);
         }
     }
-    let [ours, robot, another, theirs] = found.as_slice() else {
-        unreachable!("one for each newcomer");
-    };
+    let [ours, robot, another, theirs] = &found;
+    let connecting = "a robot's connecting to the first message of a running node, before which the portal is";
     for (what, times, floor) in [
-        ("joining a running node to its first message", &ours.0, &theirs.0),
-        ("joining it to an answer of its", &ours.1, &theirs.1),
-        (
-            "a robot's connecting to the first message of a running node, before which the portal is not",
-            &robot.0,
-            &theirs.0,
-        ),
-        (
-            "a robot's connecting to the first message of a running node, before which the portal is",
-            &another.0,
-            &theirs.0,
-        ),
+        ("joining a running node to its first message".to_owned(), &ours.0, &theirs.0),
+        ("joining it to an answer of its".to_owned(), &ours.1, &theirs.1),
+        (format!("{connecting} not"), &robot.0, &theirs.0),
+        (connecting.to_owned(), &another.0, &theirs.0),
     ] {
-        let of = |share| quantile(times, share).unwrap_or(f64::NAN);
-        let figure = report.figure(what, "ms", of(0.5));
-        figure
-            .relative_to("a participant of rclpy that joins", quantile(floor, 0.5).unwrap_or(f64::NAN))
-            .require(Target::AtMost(JOINED));
-        figure.note(format!("median of {rounds}, at most {:.0}; rclpy is imported already", of(1.0)));
+        let of = |times: &[f64], share| quantile(times, share).unwrap_or(f64::NAN);
+        let figure = report.figure(what, "ms", of(times, 0.5));
+        figure.relative_to("a participant of rclpy that joins", of(floor, 0.5)).require(Target::AtMost(JOINED));
+        figure.note(format!("median of {rounds}, at most {:.0}; rclpy is imported already", of(times, 1.0)));
     }
     Ok(())
 }

@@ -1,41 +1,36 @@
-//! `make bench ONLY=ros2`: a participant of the crate `rtps` compared with rclpy's, and a robot of the portal compared
-//! with the direct path and with other rosbridge servers: round trips of Strings, calls and goals, images in both
-//! directions, joining a running node, and idle resources. Needs root, and the Python with rclpy below
-//! `CLOUDROID_ROS2_PREFIX`. `CLOUDROID_BENCH_FULL=1` measures longer, `CLOUDROID_BENCH_SECONDS` sets how many seconds
-//! images are sent; arguments name the parts to run. The program runs itself as the participants (`inside ROLE …`), so
-//! that each is a separate process.
+//! `make bench ONLY=ros2`: a node of ours compared with rclpy's, and a robot of the portal with the direct path and
+//! other rosbridge servers. Needs root, and rclpy below `CLOUDROID_ROS2_PREFIX`. `CLOUDROID_BENCH_FULL=1` measures
+//! longer, `CLOUDROID_BENCH_SECONDS` is how long images are sent; arguments name the parts to run. The program runs
+//! itself as the participants (`inside ROLE …`).
 
 #![forbid(unsafe_code)]
 
-mod awake;
 mod bus;
-mod camera;
 mod client;
 mod cost;
 mod crowd;
-mod ends;
-mod hop;
+mod echoes;
+mod exchanges;
+mod in_flight;
 mod joins;
-mod lost;
-mod measuring;
-mod message;
+mod messages;
 mod pictures;
-mod place;
 mod portal;
 mod rivals;
 mod roles;
 mod trips;
-mod types;
+mod turns;
 mod world;
 
 use anyhow::Result;
 use bench_report::{Part, run_parts};
 
 /// Parts of the benchmark, in the order in which they run.
-const PARTS: [Part; 6] = [
+const PARTS: [Part; 7] = [
     ("trips", trips::measure_strings),
     ("calls", trips::measure_calls),
     ("goals", trips::measure_goals),
+    ("rival", in_flight::measure),
     ("joins", joins::measure),
     ("cost", cost::measure),
     ("pictures", pictures::measure),

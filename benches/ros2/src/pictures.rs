@@ -1,16 +1,101 @@
 //! Images at 30 Hz between our participant and an rclpy node with its default buffers, in both directions and with both
-//! reliabilities; and between that node and a robot of the portal.
+//! reliabilities; and between that node and a robot of the portal, each of whose stages counts its losses.
 
 use std::fmt;
+use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Process, Target, is_full_run};
-use serde_json::Value;
+use bench_report::{BenchReport, Process, Target, is_full_run, quantile_seconds};
+use bridge::Metrics;
+use serde_json::{Value, json};
 
-use crate::camera::{self, RATE};
-use crate::lost::PictureLosses;
-use crate::message::Size;
+use crate::messages::{self, Size};
 use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
+
+/// Images per second.
+pub(crate) const RATE: f64 = 30.0;
+/// Time until both sides have discovered each other.
+pub(crate) const SETTLED: Duration = Duration::from_millis(500);
+
+/// Statistics of the received frames.
+#[derive(Default)]
+pub(crate) struct FrameStatistics {
+    came: u32,
+    reordered: u32,
+    last: Option<u32>,
+    ages: Vec<Duration>,
+}
+
+impl FrameStatistics {
+    /// Returns the statistics in the form in which a role prints them.
+    pub(crate) fn to_json(&self) -> Value {
+        let milliseconds = |share| quantile_seconds(&self.ages, share) * 1e3;
+        json!({
+            "came": self.came, "reordered": self.reordered, "p50": milliseconds(0.5), "p99": milliseconds(0.99),
+        })
+    }
+
+    /// Records an image; returns `None` if the payload is not one.
+    pub(crate) fn record(&mut self, payload: &[u8]) -> Option<()> {
+        let (number, age) = messages::parse_picture(payload)?;
+        self.came += 1;
+        self.reordered += u32::from(self.last.is_some_and(|last| number <= last));
+        self.last = self.last.max(Some(number));
+        self.ages.push(age);
+        Some(())
+    }
+}
+
+/// Returns the portal's counters of the images that it has passed on.
+pub(crate) fn metrics_json(metrics: &Metrics) -> Value {
+    json!({
+        "read": metrics.published.get(), "written_off": metrics.node_dropped.get(),
+        "heard": metrics.received.get(), "bus": metrics.bus_dropped.get(), "queue": metrics.dropped.get(),
+    })
+}
+
+/// Images that did not reach the next stage.
+#[derive(Debug, PartialEq, Eq)]
+struct PictureLosses {
+    /// Losses of the portal itself.
+    portal: i64,
+    places: Vec<(&'static str, i64)>,
+}
+
+impl PictureLosses {
+    /// Computes the losses of `sent` images that a node wrote and of which a robot received `came`.
+    fn to_robot(sent: u32, came: i64, counts: &Value) -> Option<Self> {
+        let [heard, bus, queue] = ["heard", "bus", "queue"].map(|name| counts[name].as_i64());
+        let (heard, bus, queue) = (heard?, bus?, queue?);
+        let places = vec![
+            ("the node's writer or the way to the portal", i64::from(sent) - heard - bus),
+            ("the bus's queue", bus),
+            ("the robot's queue in the portal", queue),
+            ("the robot", heard - queue - came),
+        ];
+        Some(Self { portal: bus + queue, places })
+    }
+
+    /// Computes the losses of `sent` images that a robot sent and of which a node received `came`. A node that keeps
+    /// the last five may acknowledge an image and then replace it by a newer one: such a loss is the node's.
+    fn from_robot(sent: u32, came: i64, counts: &Value) -> Option<Self> {
+        let (read, written_off) = (counts["read"].as_i64()?, counts["written_off"].as_i64()?);
+        let places = vec![
+            ("the robot", i64::from(sent) - read),
+            ("the portal's writer, which the node did not follow", written_off),
+            ("the node", read - written_off - came),
+        ];
+        Some(Self { portal: written_off, places })
+    }
+}
+
+impl fmt::Display for PictureLosses {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let lost = self.places.iter().filter(|(_, count)| *count != 0);
+        let lost: Vec<String> = lost.map(|(place, count)| format!("{count} by {place}")).collect();
+        if lost.is_empty() { out.write_str("none lost anywhere") } else { write!(out, "lost: {}", lost.join(", ")) }
+    }
+}
 
 /// Sender and receiver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,14 +111,36 @@ enum PicturePath {
 
 impl fmt::Display for PicturePath {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(match self {
-            Self::In => "rclpy to ours",
-            Self::Out => "ours to rclpy",
-            Self::ToRobot => "rclpy through the portal to a robot",
-            Self::FromRobot => "robot through the portal to rclpy",
-            Self::Rclpy(Transport::Stock) => "rclpy to rclpy by shared memory",
-            Self::Rclpy(Transport::Udp) => "rclpy to rclpy by UDP",
-        })
+        match self {
+            Self::In => out.write_str("rclpy to ours"),
+            Self::Out => out.write_str("ours to rclpy"),
+            Self::ToRobot => out.write_str("rclpy through the portal to a robot"),
+            Self::FromRobot => out.write_str("robot through the portal to rclpy"),
+            Self::Rclpy(transport) => write!(out, "rclpy to rclpy by {transport}"),
+        }
+    }
+}
+
+/// Program at one end of a transfer.
+#[derive(Clone, Copy)]
+enum Peer {
+    Ours,
+    /// A client of the portal.
+    Robot,
+    Rclpy(Transport),
+}
+
+impl PicturePath {
+    /// Returns the sender and the receiver.
+    fn peers(self) -> (Peer, Peer) {
+        let stock = Peer::Rclpy(Transport::Stock);
+        match self {
+            Self::In => (stock, Peer::Ours),
+            Self::Out => (Peer::Ours, stock),
+            Self::ToRobot => (stock, Peer::Robot),
+            Self::FromRobot => (Peer::Robot, stock),
+            Self::Rclpy(transport) => (Peer::Rclpy(transport), Peer::Rclpy(transport)),
+        }
     }
 }
 
@@ -87,43 +194,39 @@ impl TransferResult {
 
 fn run_transfer(way: PicturePath, size: Size, reliable: bool, seconds: u32) -> Result<TransferResult> {
     let frames = seconds * RATE as u32;
-    let words = camera::role_arguments(size, frames, reliable);
-    let [width, height, count, quality] = words.each_ref().map(String::as_str);
-    let (taking, sending) = (["takes", quality], ["sends", width, height, count, quality]);
+    let [width, height, count] = [size.width, size.height, frames].map(|number| number.to_string());
+    let quality = if reliable { "1" } else { "0" };
     let world = BenchNetwork::new()?;
-    let of_rclpy = match way {
-        PicturePath::Rclpy(transport) => transport,
-        _ => Transport::Stock,
+    let start = |kind: Peer, words: &[&str]| match kind {
+        Peer::Ours => world.start_role(words),
+        Peer::Robot => world.start_role(&[&["client"], words].concat()),
+        Peer::Rclpy(transport) => world.start_rclpy(transport, words),
     };
+    let (sends, takes) = way.peers();
     let mut portal = match way {
         PicturePath::ToRobot | PicturePath::FromRobot => Some(world.start_role(&["portal", "kept"])?),
         _ => None,
     };
-    let as_client = |words: &[&str]| world.start_role(&[&["client"], words].concat());
-    let mut taker: BenchProgram = match way {
-        PicturePath::In => world.start_role(&taking)?,
-        PicturePath::ToRobot => as_client(&taking)?,
-        PicturePath::Out | PicturePath::FromRobot | PicturePath::Rclpy(_) => world.start_rclpy(of_rclpy, &taking)?,
-    };
-    let process = portal.as_ref().map(|portal| Process::from_pid(portal.pid()));
-    let before = process.as_ref().map(Process::total_processor_time);
-    let mut sender: BenchProgram = match way {
-        PicturePath::Out => world.start_role(&sending)?,
-        PicturePath::FromRobot => as_client(&sending)?,
-        PicturePath::In | PicturePath::ToRobot | PicturePath::Rclpy(_) => world.start_rclpy(of_rclpy, &sending)?,
-    };
-    let told = sender.answer_within(camera::transfer_timeout(frames))?;
+    let mut taker = start(takes, &["takes", quality])?;
+    let process = portal.as_ref().map(|portal: &BenchProgram| Process::from_pid(portal.pid()));
+    let before = process.as_ref().map(Process::total_processor_time).transpose()?.unwrap_or_default();
+    let mut sender = start(sends, &["sends", &width, &height, &count, quality])?;
+    let patience = Duration::from_secs_f64(f64::from(frames) / RATE * 1.5) + Duration::from_secs(30);
+    let told = sender.answer_within(patience)?;
     let took = taker.request_answer()?;
-    let lost = |counts: &Value| match way {
-        PicturePath::ToRobot => PictureLosses::to_robot(frames, json_number(&took, "came")?, counts),
-        _ => PictureLosses::from_robot(frames, json_number(&took, "came")?, counts),
-    };
-    let portal = match (&mut portal, process, before) {
-        (Some(program), Some(process), Some(before)) => Some(PortalUsage {
-            processor: (process.total_processor_time()? - before?).as_secs_f64() * 1e3,
-            peak: process.peak()?,
-            lost: lost(&program.request_answer()?)?,
-        }),
+    let portal = match (&mut portal, process) {
+        (Some(program), Some(process)) => {
+            let (counts, came) = (program.request_answer()?, json_number(&took, "came")? as i64);
+            let lost = match way {
+                PicturePath::ToRobot => PictureLosses::to_robot(frames, came, &counts),
+                _ => PictureLosses::from_robot(frames, came, &counts),
+            };
+            Some(PortalUsage {
+                processor: (process.total_processor_time()? - before).as_secs_f64() * 1e3,
+                peak: process.peak()?,
+                lost: lost.with_context(|| format!("a counter is missing: {counts}"))?,
+            })
+        }
         _ => None,
     };
     Ok(TransferResult { sent: frames, sender: told, taker: took, portal })
@@ -206,21 +309,46 @@ fn report_transfer(
             continue;
         }
         let ([sender, taker], [sends, takes]) = (found.processor_per_frame()?, floor.processor_per_frame()?);
-        let title = format!("{what}: processor for a frame, both sides");
-        report
-            .figure(title, "ms", sender + taker)
-            .relative_to(peer.to_string(), sends + takes)
-            .note(format!("sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"));
-        let title = format!("{what}: age when taken, p50");
-        report
-            .figure(title, "ms", json_number(&found.taker, "p50")?)
-            .relative_to(peer.to_string(), json_number(&floor.taker, "p50")?)
-            .note(format!("p99 {:.1}", json_number(&found.taker, "p99")?));
+        let figure = report.figure(format!("{what}: processor for a frame, both sides"), "ms", sender + taker);
+        figure.relative_to(peer.to_string(), sends + takes);
+        figure.note(format!("sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"));
+        let figure = report.figure(format!("{what}: age when taken, p50"), "ms", json_number(&found.taker, "p50")?);
+        figure.relative_to(peer.to_string(), json_number(&floor.taker, "p50")?);
+        figure.note(format!("p99 {:.1}", json_number(&found.taker, "p99")?));
     }
     if let Some(peak) = found.peak_memory() {
-        report
-            .figure(format!("{what}: memory of ours, at its peak"), "MB", peak)
-            .note("resident, of the whole process");
+        let figure = report.figure(format!("{what}: memory of ours, at its peak"), "MB", peak);
+        figure.note("resident, of the whole process");
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_comes_after_a_later_one_is_out_of_order() {
+        let mut seen = FrameStatistics::default();
+        for number in [0, 1, 3, 2, 4] {
+            seen.record(&messages::picture(number, Size { width: 2, height: 2 })).expect("a picture");
+        }
+        assert_eq!((seen.came, seen.reordered), (5, 1));
+        assert!(seen.record(b"no picture").is_none());
+    }
+
+    #[test]
+    fn each_loss_is_its_places() {
+        let counts = json!({"read": 98, "written_off": 3, "heard": 97, "bus": 1, "queue": 10});
+        let lost = PictureLosses::to_robot(100, 85, &counts).expect("counts");
+        let places = "2 by the node's writer or the way to the portal, 1 by the bus's queue, 10 by the robot's queue \
+                      in the portal, 2 by the robot";
+        assert_eq!((lost.portal, lost.to_string()), (11, format!("lost: {places}")));
+        let lost = PictureLosses::from_robot(100, 91, &counts).expect("counts");
+        let places = "2 by the robot, 3 by the portal's writer, which the node did not follow, 4 by the node";
+        assert_eq!((lost.portal, lost.to_string()), (3, format!("lost: {places}")));
+        let whole = json!({"heard": 5, "bus": 0, "queue": 0});
+        let lost = PictureLosses::to_robot(5, 5, &whole).expect("counts");
+        assert_eq!(lost.to_string(), "none lost anywhere");
+    }
 }

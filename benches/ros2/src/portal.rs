@@ -1,5 +1,4 @@
-//! Parts that a daemon sets up for a servant of ROS 2: a bus in the servant's network, the tap, the bridge; and a
-//! WebSocket per client. Everything before the session is left out: HTTP, the policy, and finding the servant.
+//! What a daemon sets up for a servant of ROS 2 (bus, tap, bridge) and a WebSocket per client, without HTTP and policy.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -7,26 +6,22 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail};
 use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use reach::tap::Tap;
-use ros::JoinOptions;
-use ros::bus::RosVersion;
+use ros::net::{HostSockets, Sockets};
 use ros::schema::Registry;
 use serde_json::json;
-use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::lost;
-use crate::measuring::{print_json, wait_for_request};
-use crate::place::NamespaceSockets;
-use crate::types;
+use crate::exchanges::{print_json, print_ready, wait_for_request};
+use crate::pictures::metrics_json;
+use crate::{bus, messages};
 
 /// Address of every rosbridge server under measurement, each in a network of its own.
 pub(crate) const ADDRESS: &str = "127.0.0.1:9090";
 /// Name of a daemon's node in its servants.
 const NODE: &str = "/cloudroid_bridge";
 
-/// Runs the role `portal kept`, with one bridge that exists before its clients, or `portal fresh`, which creates a
-/// bridge for each client, as for the first robot of a running servant. When asked, `portal kept` prints how many
-/// messages it has passed on and dropped.
+/// Runs the role `portal kept`, with one bridge that exists before its clients and tells its counters, or `portal
+/// fresh`, with a bridge for each client.
 pub(crate) fn run(words: &[&str]) -> Result<()> {
     let kept = match words {
         ["kept"] => true,
@@ -36,13 +31,13 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     // The same threads as in a daemon's portal.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("portal").build()?;
     let served = runtime.block_on(async {
-        let known = Arc::new(types::registry()?);
-        let bridge = if kept { Some(join_bridge(NetNs::current()?, &known).await?) } else { None };
+        let known = Arc::new(messages::registry()?);
+        let bridge = if kept { Some(join_bridge(Arc::new(HostSockets), &known).await?) } else { None };
         let listener = TcpListener::bind(ADDRESS).await?;
-        print_json(&json!({}));
+        print_ready();
         tokio::spawn(accept_clients(listener, bridge.clone(), known));
         while wait_for_request().await? {
-            print_json(&bridge.as_ref().map_or(json!({}), |bridge| lost::metrics_json(bridge.metrics())));
+            print_json(&bridge.as_ref().map_or(json!({}), |bridge| metrics_json(bridge.metrics())));
         }
         anyhow::Ok(())
     });
@@ -52,10 +47,8 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
 }
 
 /// Creates a bridge to the nodes of this network, as a daemon does for a servant.
-pub(crate) async fn join_bridge(network: NetNs, known: &Arc<Registry>) -> Result<Arc<Bridge>> {
-    let options = JoinOptions::in_domain(0, NODE);
-    let bus = ros::connect(RosVersion::Two, Arc::new(NamespaceSockets(network)), options).await?;
-    let bus = Arc::new(Tap::default()).wrap(bus);
+pub(crate) async fn join_bridge(sockets: Arc<dyn Sockets>, known: &Arc<Registry>) -> Result<Arc<Bridge>> {
+    let bus = Arc::new(Tap::default()).wrap(bus::join(sockets, NODE).await?);
     Ok(Bridge::new(bus, known.clone(), BridgeOptions::default()))
 }
 
@@ -84,7 +77,7 @@ async fn serve_client(
     let socket = tokio_tungstenite::accept_async(stream).await.context("the client's handshake")?;
     let bridge = match bridge {
         Some(bridge) => bridge,
-        None => join_bridge(NetNs::current()?, known).await?,
+        None => join_bridge(Arc::new(HostSockets), known).await?,
     };
     let options = SessionOptions { client: from.to_string(), ..SessionOptions::default() };
     // A client sends nothing before it has read the handshake's response, so nothing was read ahead.

@@ -1,8 +1,5 @@
-//! Other rosbridge servers, in the network of the nodes with which our portal is measured.
-//!
-//! rosbridge-server-rs is a wheel, which pip installs into `target/bench` (`rivals.requirements.txt`). rosbridge_suite
-//! is not in any registry: `CLOUDROID_ROSBRIDGE_SUITE` may name an install space of its branch `ros2`, as colcon
-//! creates it with `--merge-install`.
+//! Other rosbridge servers in the network of the nodes: rosbridge-server-rs, a wheel, and rosbridge_suite, if
+//! `CLOUDROID_ROSBRIDGE_SUITE` names an install space of its branch `ros2` (colcon's `--merge-install`).
 
 use std::fmt;
 use std::os::unix::fs::symlink;
@@ -20,7 +17,37 @@ const SUITE: &str = "CLOUDROID_ROSBRIDGE_SUITE";
 /// Path of its server in the install space.
 const SUITE_SERVER: &str = "lib/rosbridge_server/rosbridge_websocket.py";
 
-/// A server that can be started.
+/// A server between clients and nodes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Server {
+    Portal,
+    Rival(Rival),
+    /// A process that copies bytes to datagrams and back.
+    Hop,
+}
+
+impl fmt::Display for Server {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Portal => out.write_str("portal"),
+            Self::Rival(rival) => write!(out, "{rival}"),
+            Self::Hop => out.write_str("byte relay"),
+        }
+    }
+}
+
+impl Server {
+    /// Starts the server in this network.
+    pub(crate) fn start(&self, world: &BenchNetwork) -> Result<BenchProgram> {
+        match self {
+            Self::Portal => world.start_role(&["portal", "kept"]),
+            Self::Rival(rival) => rival.start(world),
+            Self::Hop => world.start_role(&["hop"]),
+        }
+    }
+}
+
+/// A server of others that can be started.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Rival {
     /// Directory into which the wheel is installed.
@@ -52,7 +79,7 @@ impl Rival {
     }
 
     /// Starts the server in this network; it listens a moment later.
-    pub(crate) fn start(&self, world: &BenchNetwork) -> Result<BenchProgram> {
+    fn start(&self, world: &BenchNetwork) -> Result<BenchProgram> {
         let prefix = world::wheels_prefix()?;
         let mut command = world.command();
         // Its home directory is private to this network.

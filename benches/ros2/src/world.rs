@@ -1,5 +1,6 @@
 //! A private network with a /dev/shm of its own, like a servant's; and the programs that run in it.
 
+use std::fmt;
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -25,9 +26,14 @@ pub(crate) enum Transport {
     Udp,
 }
 
-/// Cores on which programs run. Robot and server represent two machines, whose programs never share a core. If the
-/// kernel chose, two communicating programs would share a core or not by chance, and the same path would take twice or
-/// half as long.
+impl fmt::Display for Transport {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(if *self == Self::Stock { "shared memory" } else { "UDP" })
+    }
+}
+
+/// Cores on which programs run. Robot and server never share one: if the kernel chose, the same path would take twice
+/// or half as long by chance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Host {
     /// The first core that this program may use.
@@ -103,6 +109,17 @@ impl BenchNetwork {
         }
         BenchProgram::start(command, &format!("rclpy, {}", words.join(" ")))
     }
+}
+
+/// Keeps the cores awake by loops of the lowest priority, as long as the result exists: waking a halted core of a
+/// virtual machine takes longer than what is measured, and medians would differ by a factor of three.
+pub(crate) fn keep_cores_awake() -> Result<Vec<BenchProgram>> {
+    let one = |core: usize| {
+        let mut command = Command::new("setpriv");
+        command.args(["--pdeathsig", "KILL", "chrt", "--idle", "0", "sh", "-c", "while :; do :; done"]);
+        BenchProgram::start_quietly(command, &format!("what keeps core {core} awake"))
+    };
+    (0..std::thread::available_parallelism()?.get()).map(one).collect()
 }
 
 /// Returns the directory of the wheels (`scripts/ros2-wheels`).

@@ -1,6 +1,5 @@
-//! libcontainer alone: the same container created by a single-threaded program that does nothing else. Either with the
-//! whole spec including limits, or without any cgroup, which is the lower bound for our own container creation. The
-//! other work of the engine (shim, Master, log, init, node) is not included.
+//! libcontainer alone: the same container created by a single-threaded program, either with limits, or without any
+//! cgroup, which is the lower bound. Shim, Master, log, init and node are not included.
 
 use std::fs::{self, File};
 use std::path::Path;

@@ -1,5 +1,4 @@
-//! OCI bundles for the peers: the configuration of a servant, with the network namespace and the limits that our engine
-//! sets up itself, and the root of the image.
+//! OCI bundles for the peers: a servant's configuration with what our engine sets up itself, and the image's root.
 
 use std::fs;
 use std::path::Path;

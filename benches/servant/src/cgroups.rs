@@ -44,8 +44,7 @@ impl Drop for BenchCgroup {
 /// Mount point of cgroup version 2 on hosts with both versions.
 const UNIFIED: &str = "/sys/fs/cgroup/unified";
 
-/// Runs `work` in a thread that sees only version 1 on a host with both versions of cgroups, because crun refuses to
-/// run there ("cgroups in hybrid mode not supported"). The mounts are visible to this thread and its child processes.
+/// Runs `work` in a thread that sees only version 1 where both versions are mounted, because crun refuses hybrid mode.
 pub(crate) fn with_only_version_1<T: Send>(work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
     let covered = || {
         unshare(CloneFlags::CLONE_NEWNS).context("a mount namespace for a peer")?;

@@ -36,12 +36,9 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, image: &Se
     daemon.stop_servants()?;
     // Once more, because the load on a shared machine may have changed meanwhile.
     first.extend(starts("on an idle host")?);
-    let title = format!("start of servant {}", crowd + 1);
-    report
-        .figure(title, "ms", quantile_seconds(&last, 0.5) * 1e3)
-        .relative_to("the first, before and after", quantile_seconds(&first, 0.5) * 1e3)
-        .require(Target::RatioAtMost(1.5))
-        .note(format!("medians of {STARTS} and {}", 2 * STARTS));
+    let figure = report.figure(format!("start of servant {}", crowd + 1), "ms", quantile_seconds(&last, 0.5) * 1e3);
+    figure.relative_to("the first, before and after", quantile_seconds(&first, 0.5) * 1e3);
+    figure.require(Target::RatioAtMost(1.5)).note(format!("medians of {STARTS} and {}", 2 * STARTS));
     Ok(())
 }
 
@@ -70,10 +67,9 @@ fn report_overhead(report: &mut BenchReport, daemon: &BenchDaemon, count: usize)
     let mean = costs.iter().sum::<f64>() / costs.len() as f64;
     let inits = all.iter().map(|one| Process::from_pid(one.init).proportional()).collect::<Result<Vec<_>>>()?;
     let init = inits.iter().sum::<f64>() / inits.len() as f64;
-    report
-        .figure(format!("shim + init, each of {count} idle"), "MB", mean)
-        .require(Target::AtMost(MEMORY))
-        .note(format!("PSS; most {:.2}, init {init:.2}", costs.iter().copied().fold(0.0, f64::max)));
+    let figure = report.figure(format!("shim + init, each of {count} idle"), "MB", mean);
+    figure.require(Target::AtMost(MEMORY));
+    figure.note(format!("PSS; most {:.2}, init {init:.2}", costs.iter().copied().fold(0.0, f64::max)));
     Ok(())
 }
 
@@ -82,11 +78,12 @@ fn report_total(report: &mut BenchReport, daemon: &BenchDaemon, count: usize, wa
     let all = ServantOverhead::for_all_servants(daemon)?;
     let of_daemon = Process::from_pid(daemon.pid()).proportional()?;
     let of_servants = all.iter().map(|one| one.memory()).sum::<Result<f64>>()?;
-    let title = format!("daemon, shims, inits, per servant of {count}");
-    report
-        .figure(title, "MB", (of_daemon + of_servants) / count as f64)
-        .require(Target::AtMost(MEMORY))
-        .note(format!("PSS; the daemon {of_daemon:.1}"));
+    let figure = report.figure(
+        format!("daemon, shims, inits, per servant of {count}"),
+        "MB",
+        (of_daemon + of_servants) / count as f64,
+    );
+    figure.require(Target::AtMost(MEMORY)).note(format!("PSS; the daemon {of_daemon:.1}"));
     let sum =
         |pick: fn(&ServantOverhead) -> i32| all.iter().map(|one| processor_time(pick(one))).sum::<Result<Duration>>();
     let used =
@@ -97,10 +94,9 @@ fn report_total(report: &mut BenchReport, daemon: &BenchDaemon, count: usize, wa
     let (after, lasted) = (used()?, begun.elapsed());
     let share = |index: usize| (after[index] - before[index]).as_secs_f64() / lasted.as_secs_f64() * 100.0;
     let [daemon, shims, inits] = [share(0), share(1), share(2)];
-    let title = format!("idle processor, all of ours, {count} servants");
-    report
-        .figure(title, "%", daemon + shims + inits)
-        .require(Target::AtMost(IDLE))
+    let figure = report.figure(format!("idle processor, all of ours, {count} servants"), "%", daemon + shims + inits);
+    figure.require(Target::AtMost(IDLE));
+    figure
         .note(format!("of a core over {} s; daemon {daemon:.3}, shims {shims:.3}, inits {inits:.3}", watch.as_secs()));
     Ok(())
 }

@@ -21,8 +21,7 @@ pub(crate) struct ServiceImage {
 }
 
 impl ServiceImage {
-    /// Starts a servant of the service and reads its specification; the daemon must have no other servants, and has
-    /// none afterwards.
+    /// Starts the only servant of the daemon, reads its specification, and waits until it has ended.
     pub(crate) fn inspect(daemon: &BenchDaemon, service: &str) -> Result<Self> {
         let mut robot = daemon.robot(service)?;
         list_nodes(&mut robot)?;
@@ -55,8 +54,7 @@ impl ServiceImage {
     }
 }
 
-/// Returns the record of the servant whose nodes were started. A container of the warm pool has a record as well,
-/// without nodes; on a busy machine that one may be seen first.
+/// Returns the record of the servant whose nodes were started: a container of the warm pool has none.
 fn find_started(daemon: &BenchDaemon) -> Result<LaunchRecord> {
     support::wait_until("a servant with a record of its nodes", || {
         for id in daemon.servants()? {

@@ -1,6 +1,5 @@
-//! `make bench ONLY=servant`: cost of a servant, compared with the same node started alone, with libcontainer called
-//! from a minimal program, and with other installed runtimes and engines (runc, crun, podman). The argument `starts`
-//! runs that part alone. Needs root. The program runs itself as the minimal program (`bare HOW DIRECTORY`).
+//! `make bench ONLY=servant`: cost of a servant beside the same node alone, libcontainer alone, and runc, crun and
+//! podman. The argument `starts` runs that part alone. Needs root. The program runs itself as `bare HOW DIRECTORY`.
 
 #![deny(unsafe_code)]
 

@@ -1,11 +1,8 @@
-//! The node alone: executed in a chroot of the same layers and in an existing network namespace, until it has
-//! registered with a Master like that of a servant.
+//! The node alone: executed in a chroot of the same layers and an existing network, until it has registered.
 
 #![allow(unsafe_code)]
 
 use std::ffi::CString;
-use std::io;
-use std::net::{Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -14,19 +11,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use async_trait::async_trait;
 use nix::sched::{CloneFlags, setns};
-use ros::net::Sockets;
+use reach::ServantSockets;
 use ros::ros1::master::{Master, MasterOptions};
+use ros::ros1::process::MASTER;
 use servant::netns::NetNs;
-use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 
 use crate::image::ServiceImage;
 use crate::root::ImageRoot;
 
-/// Address of the Master in every servant.
-const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
 /// Maximum time until the node has registered.
 const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -36,19 +30,6 @@ pub(crate) struct NativeNode<'a> {
     root: ImageRoot,
     network: Arc<NetNs>,
     runtime: &'a Handle,
-}
-
-struct NativeSockets(Arc<NetNs>);
-
-#[async_trait]
-impl Sockets for NativeSockets {
-    async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
-        self.0.connect(address).await
-    }
-
-    async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener> {
-        self.0.listen(address).await
-    }
 }
 
 impl<'a> NativeNode<'a> {
@@ -63,7 +44,7 @@ impl<'a> NativeNode<'a> {
     pub(crate) fn time_start(&self) -> Result<Duration> {
         let listener = self.runtime.block_on(self.network.listen(MASTER))?;
         let master = Master::new(MasterOptions::default());
-        let sockets = Arc::new(NativeSockets(self.network.clone()));
+        let sockets = Arc::new(ServantSockets::new(&self.network));
         let serving = {
             let master = master.clone();
             self.runtime.spawn(async move { master.serve(listener, sockets).await })

@@ -23,8 +23,7 @@ const ENGINE: &str = "podman";
 pub(crate) struct PeerRuntime {
     /// Name of the program.
     pub(crate) name: &'static str,
-    /// State directory of an engine, kept from one container to the next. Its path is short, because podman refuses
-    /// more than 50 characters.
+    /// State directory of an engine; its path is short, because podman refuses more than 50 characters.
     store: Option<TempDir>,
 }
 
@@ -65,43 +64,24 @@ impl PeerRuntime {
         started.and(removed).map(|()| took)
     }
 
-    /// Measures an engine: the same root below a writable layer, which engines give their containers, the same limits,
-    /// no network.
+    /// Measures an engine: the same root below a writable layer, the same limits, no network.
     fn time_engine(&self, place: &Path, store: &Path, spec: &ContainerSpec) -> Result<Duration> {
         let (root, cgroups) = (ImageRoot::mount(place, spec)?, BenchCgroup::reserve()?);
         let [images, run, temporary] = ["images", "run", "tmp"].map(|name| store.join(name).display().to_string());
-        let global = [
-            "--root",
-            &images,
-            "--runroot",
-            &run,
-            "--tmpdir",
-            &temporary,
-            "--storage-driver",
-            "vfs",
-            "--cgroup-manager",
-            "cgroupfs",
-        ];
+        let global = ["--root", &images, "--runroot", &run, "--tmpdir", &temporary];
+        let global = [&global[..], &["--storage-driver", "vfs", "--cgroup-manager", "cgroupfs"]].concat();
         let limits = &spec.limits;
         let number = |option: &str, value: Option<String>| value.map(|value| format!("--{option}={value}"));
-        let mut words = vec![
-            "run".to_owned(),
-            "--detach".to_owned(),
-            format!("--name={}", spec.id),
-            "--network=none".to_owned(),
-            "--log-driver=none".to_owned(),
-            format!("--cgroup-parent={}", cgroups.parent()),
-            // The monitor process stays in our cgroup.
-            "--cgroups=no-conmon".to_owned(),
-            // Without CAP_SYS_RESOURCE, its default exceeds the permitted maximum.
-            "--ulimit=nofile=1024:1024".to_owned(),
-            "--ulimit=nproc=4096:4096".to_owned(),
-        ];
+        // The monitor process stays in our cgroup. Without CAP_SYS_RESOURCE, the default limits exceed the permitted
+        // maximum.
+        let options = "run --detach --network=none --log-driver=none --cgroups=no-conmon --ulimit=nofile=1024:1024 \
+                       --ulimit=nproc=4096:4096";
+        let mut words: Vec<String> = options.split(' ').map(str::to_owned).collect();
+        words.extend([format!("--name={}", spec.id), format!("--cgroup-parent={}", cgroups.parent())]);
         words.extend(number("memory", limits.memory.map(|bytes| bytes.to_string())));
         words.extend(number("cpus", limits.cpus.map(|cpus| cpus.to_string())));
         words.extend(number("pids-limit", limits.pids.map(|pids| pids.to_string())));
-        words.push("--rootfs".to_owned());
-        words.push(format!("{}:O", root.path().display()));
+        words.extend(["--rootfs".to_owned(), format!("{}:O", root.path().display())]);
         words.extend(PROGRAM.map(str::to_owned));
         let words: Vec<&str> = words.iter().map(String::as_str).collect();
         let begun = Instant::now();

@@ -157,43 +157,38 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
     let unlimited = needed(UNLIMITED)?;
     // If libcontainer cannot set limits, the container without limits is the reference.
     let bare = of(LIMITED).unwrap_or(unlimited);
-    let title = "robot connects → node registered, bridged";
-    report
-        .figure(title, "ms", robots.median_milliseconds())
-        .relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds())
-        .require(Target::RatioAtMost(1.0))
-        .note(format!("medians of {rounds}, in turns; best {:.1} ms", robots.best().as_secs_f64() * 1e3));
-    let title = "robot connects → node registered, bridged, without a container made ahead";
-    report
-        .figure(title, "ms", needed(COLD)?.median_milliseconds())
-        .relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds())
-        .note("the first robot of a service, and robots that come faster than containers are made");
-    let title = "robot connects → node registered, bridged, in a container made ahead";
-    report
-        .figure(title, "ms", robots.median_milliseconds())
-        .relative_to("node alone", node)
-        .require(Target::RatioAtMost(1.2));
+    let figure = report.figure("robot connects → node registered, bridged", "ms", robots.median_milliseconds());
+    figure.relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds());
+    figure.require(Target::RatioAtMost(1.0));
+    figure.note(format!("medians of {rounds}, in turns; best {:.1} ms", robots.best().as_secs_f64() * 1e3));
+    let figure = report.figure(
+        "robot connects → node registered, bridged, without a container made ahead",
+        "ms",
+        needed(COLD)?.median_milliseconds(),
+    );
+    figure.relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds());
+    figure.note("the first robot of a service, and robots that come faster than containers are made");
+    let figure = report.figure(
+        "robot connects → node registered, bridged, in a container made ahead",
+        "ms",
+        robots.median_milliseconds(),
+    );
+    figure.relative_to("node alone", node).require(Target::RatioAtMost(1.2));
     let ready = needed(READY)?;
-    let title = "robot connects → first answer, nodes running already";
-    report
-        .figure(title, "ms", ready.median_milliseconds())
-        .relative_to(UPGRADE, needed(UPGRADE)?.median_milliseconds())
-        .require(Target::RatioAtMost(10.0))
-        .note(format!("warm_nodes = 1; the answer names the node; best {:.2} ms", ready.best().as_secs_f64() * 1e3));
-    report
-        .figure("node alone: exec → registered", "ms", node)
-        .note("in a chroot of the same layers, namespaces ready, the same Master");
-    report
-        .figure("create → running", "ms", engine)
-        .relative_to(bare.name.clone(), bare.median_milliseconds())
-        .require(Target::RatioAtMost(1.5))
-        .note("ours with limits read back, shim, Master and init");
+    let figure =
+        report.figure("robot connects → first answer, nodes running already", "ms", ready.median_milliseconds());
+    figure.relative_to(UPGRADE, needed(UPGRADE)?.median_milliseconds()).require(Target::RatioAtMost(10.0));
+    figure.note(format!("warm_nodes = 1; the answer names the node; best {:.2} ms", ready.best().as_secs_f64() * 1e3));
+    let figure = report.figure("node alone: exec → registered", "ms", node);
+    figure.note("in a chroot of the same layers, namespaces ready, the same Master");
+    let figure = report.figure("create → running", "ms", engine);
+    figure.relative_to(bare.name.clone(), bare.median_milliseconds()).require(Target::RatioAtMost(1.5));
+    figure.note("ours with limits read back, shim, Master and init");
     for other in all.iter().filter(|times| ![ROBOT, COLD, READY, UPGRADE, NODE, ENGINE].contains(&times.name.as_str()))
     {
         if other.name != bare.name {
-            report
-                .figure("create → running", "ms", engine)
-                .relative_to(other.name.clone(), other.median_milliseconds());
+            let figure = report.figure("create → running", "ms", engine);
+            figure.relative_to(other.name.clone(), other.median_milliseconds());
         }
     }
     Ok(())

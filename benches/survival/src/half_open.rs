@@ -60,7 +60,7 @@ fn lose_clients(daemon: &Daemon) -> Result<Duration> {
     let mut first = daemon.robot(&greeters::robot_path("half-open"))?;
     greeters::greeting_count(&mut first)?;
     first.leave()?;
-    let before = Resources::read(daemon.pid())?.descriptors;
+    let before = Resources::read(daemon)?.descriptors;
     let freezer = Freezer::new(&daemon.address)?;
     let url = format!("ws://{}/{}", freezer.server, greeters::robot_path("half-open"));
     let crowd = IdleCrowd::connect(&url, CLIENTS)?;
@@ -68,7 +68,7 @@ fn lose_clients(daemon: &Daemon) -> Result<Duration> {
     ensure!(silent == CLIENTS, "{silent} of {CLIENTS} connections are there");
     let began = Instant::now();
     support::wait_until("the end of connections that carry nothing", || {
-        let now = Resources::read(daemon.pid())?.descriptors;
+        let now = Resources::read(daemon)?.descriptors;
         Ok((now <= before).then_some(()).ok_or_else(|| format!("{now} descriptors, {before} before")))
     })?;
     let took = began.elapsed();

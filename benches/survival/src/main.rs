@@ -5,8 +5,8 @@
 //!  upgrade    26 working servants while the daemon is replaced: servants lost, longest gap that a robot sees
 //!  wear       one daemon, twice: kill -9 of shims, inits and nodes, crowds, half-open connections; resources of its
 //!             process after the second time compared with the first
-//!  soak       the same daemon: mixed load of 20 robots for CLOUDROID_BENCH_SOAK (default: 3m), such as 1h;
-//!             resources of its process
+//!  soak       the same daemon: mixed load of 20 robots of both ROS for CLOUDROID_BENCH_SOAK (default: 3m), such as
+//!             1h; resources of its process, and the p99 of calls in each sixtieth of the time
 //!  disk       a full disk: working robots, new robots, changes that were confirmed
 //! ```
 //! One of these words as an argument runs that part alone. `CLOUDROID_BENCH_ROUNDS` sets the number of kills of each

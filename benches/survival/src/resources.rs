@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use anyhow::Result;
+use anyhow::{Context, Result, ensure};
 use bench_report::{BenchReport, Process, Target};
+use support::daemon::Daemon;
 
 /// Idle threads of a pool end after 10 s, and freed memory is returned every 30 s.
 const REST: Duration = Duration::from_secs(45);
@@ -18,8 +19,10 @@ const FLAT: f64 = 1.02;
 pub(crate) struct Resources {
     /// Resident memory in megabytes (10⁶).
     pub(crate) resident: f64,
-    /// Anonymous resident memory, which excludes files: what the process has allocated.
+    /// Anonymous resident memory, which excludes files: what is allocated, and free memory between.
     pub(crate) anonymous: f64,
+    /// Memory that the daemon has allocated and not freed, by its own metric.
+    pub(crate) allocated: f64,
     /// Proportional set size: less the more processes of the program run.
     pub(crate) proportional: f64,
     /// Open descriptors.
@@ -29,24 +32,25 @@ pub(crate) struct Resources {
 }
 
 impl Resources {
-    /// Reads the resources of a process.
-    pub(crate) fn read(pid: i32) -> Result<Self> {
-        let process = Process::from_pid(pid);
+    /// Reads the resources of a daemon.
+    pub(crate) fn read(daemon: &Daemon) -> Result<Self> {
+        let process = Process::from_pid(daemon.pid());
         Ok(Self {
             resident: process.resident()?,
             anonymous: process.anonymous()?,
+            allocated: read_allocated(daemon)?,
             proportional: process.proportional()?,
             descriptors: process.descriptors()? as f64,
             threads: process.threads()? as f64,
         })
     }
 
-    /// Reads the resources of a process after an idle period.
-    pub(crate) fn read_at_rest(pid: i32) -> Result<Self> {
+    /// Reads the resources of a daemon after an idle period.
+    pub(crate) fn read_at_rest(daemon: &Daemon) -> Result<Self> {
         std::thread::sleep(REST);
         let mut looks = Vec::new();
         for _ in 0..LOOKS {
-            looks.push(Self::read(pid)?);
+            looks.push(Self::read(daemon)?);
             std::thread::sleep(PAUSE);
         }
         Ok(Self::median(&looks))
@@ -61,6 +65,7 @@ impl Resources {
         Self {
             resident: middle(|look| look.resident),
             anonymous: middle(|look| look.anonymous),
+            allocated: middle(|look| look.allocated),
             proportional: middle(|look| look.proportional),
             descriptors: middle(|look| look.descriptors),
             threads: middle(|look| look.threads),
@@ -75,9 +80,14 @@ impl Resources {
             .relative_to(when, before.resident)
             .require(Target::RatioAtMost(FLAT))
             .note(format!(
-                "allocated {:.1} MB after {:.1} MB; PSS {:.1} MB after {:.1} MB",
+                "anonymous {:.1} MB after {:.1} MB; PSS {:.1} MB after {:.1} MB",
                 self.anonymous, before.anonymous, self.proportional, before.proportional
             ));
+        let title = format!("memory that the daemon has allocated after {what}");
+        report
+            .figure(title, "MB", self.allocated)
+            .relative_to(when, before.allocated)
+            .require(Target::RatioAtMost(FLAT));
         let title = format!("open descriptors of the daemon after {what}");
         report
             .figure(title, "", self.descriptors)
@@ -85,4 +95,13 @@ impl Resources {
             .require(Target::RatioAtMost(FLAT))
             .note(format!("{} threads after {}", self.threads, before.threads));
     }
+}
+
+/// Returns `cloudroid_heap_bytes` in megabytes.
+fn read_allocated(daemon: &Daemon) -> Result<f64> {
+    let (status, text) = daemon.request("GET", "/metrics", &[])?;
+    ensure!(status == 200, "{text}");
+    let value = text.lines().find_map(|line| line.strip_prefix("cloudroid_heap_bytes "));
+    let bytes: f64 = value.context("cloudroid_heap_bytes")?.parse()?;
+    Ok(bytes / 1e6)
 }

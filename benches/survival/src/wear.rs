@@ -14,9 +14,9 @@ use crate::{crowds, half_open};
 pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon, kills: u32, few: u32) -> Result<()> {
     // The figures of the first pass are nobody's.
     make_pass(&mut BenchReport::new("first"), daemon, few, few)?;
-    let before = Resources::read_at_rest(daemon.pid())?;
+    let before = Resources::read_at_rest(daemon)?;
     make_pass(report, daemon, kills, few)?;
-    let after = Resources::read_at_rest(daemon.pid())?;
+    let after = Resources::read_at_rest(daemon)?;
     let before = ("after the first time", before);
     after.add_figures(report, "all this a second time", before);
     Ok(())
@@ -36,6 +36,6 @@ fn make_pass(report: &mut BenchReport, daemon: &Daemon, kills: u32, few: u32) ->
 
 /// Prints the resources, to show which part made them grow.
 fn print_resources(daemon: &Daemon, after: &str) -> Result<()> {
-    eprintln!("{after}: {:?}", Resources::read(daemon.pid())?);
+    eprintln!("{after}: {:?}", Resources::read(daemon)?);
     Ok(())
 }

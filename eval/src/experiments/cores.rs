@@ -1,34 +1,51 @@
 //! Part of experiment 2: packages in the cloud with several limits of cores, a model of their response times that is
 //! fitted to some of them, its error at the others, and its predictions for clouds with more cores than this machine.
 
-mod drawn;
 mod model;
-mod told;
+mod report;
 
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::{RunCache, Runs};
 use crate::examples::{DETECTOR, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
 use crate::place::{NetworkProfile, RobotHardware, RunCost};
 use crate::robot::NodeUnderTest;
-use crate::trace::Trace;
+use crate::section::About;
+use crate::statistics::Spread;
+use crate::trace::{ResponseParts, Trace};
 
-use model::{Model, ResponseParts, mean_parts};
-pub use told::section;
+use model::Model;
+pub use report::section;
 
 /// Network between robot and servant.
 const NETWORK: NetworkProfile = NetworkProfile::Lan;
+
+/// The experiment.
+pub const ABOUT: About = About {
+    number: 2,
+    id: "cores",
+    title: "What more cores would give: a model, and its error at points that were held back",
+    published: "Fig. 5 of the publication: outsourced to a cloud of many cores, packages answered up to 25 times as \
+        fast as on a Raspberry Pi.",
+    differs: &[
+        "Each part of the response time has a model of its own, overhead + work / min(cores, parallel), fitted to \
+         means of whole runs, because only means follow a limit of a fraction of a core: the kernel stops the program \
+         for a part of each tenth of a second.",
+        "The cautious prediction: more cores than were measured give nothing more. The bound, for several threads: all \
+         work of the computation is divided among all cores as among the first ones.",
+        "Robot, daemon and servant share this machine's cores. The model knows no other speed of cores, no GPU, no \
+         other robots and no other network than the LAN.",
+    ],
+};
 
 /// A program, and the limits at which it is measured.
 #[derive(Debug, Clone, Copy)]
 pub struct Subject {
     example: EvalPackage,
-    /// Name in the report.
     name: &'static str,
     /// Arguments of its node in addition to the example's own.
     arguments: &'static [&'static str],
-    /// Number of threads of its computation.
     threads: usize,
     fitted: &'static [f64],
     /// Some limits between the fitted ones, and one above them, because the predictions lie above them as well.
@@ -36,25 +53,18 @@ pub struct Subject {
     requests: usize,
 }
 
+const SLAM: Subject = Subject {
+    example: LASER_SLAM,
+    name: "laser_slam",
+    arguments: &[],
+    threads: 1,
+    fitted: &[0.25, 0.5, 1.0, 1.25],
+    held_back: &[0.35, 0.75, 1.5],
+    requests: 60,
+};
 const SUBJECTS: [Subject; 3] = [
-    Subject {
-        example: LASER_SLAM,
-        name: "laser_slam",
-        arguments: &[],
-        threads: 1,
-        fitted: &[0.25, 0.5, 1.0, 1.25],
-        held_back: &[0.35, 0.75, 1.5],
-        requests: 60,
-    },
-    Subject {
-        example: DETECTOR,
-        name: "object_detector, 1 thread",
-        arguments: &[],
-        threads: 1,
-        fitted: &[0.25, 0.5, 1.0, 1.25],
-        held_back: &[0.35, 0.75, 1.5],
-        requests: 16,
-    },
+    SLAM,
+    Subject { example: DETECTOR, name: "object_detector, 1 thread", requests: 16, ..SLAM },
     Subject {
         example: DETECTOR,
         name: "object_detector, 2 threads",
@@ -65,14 +75,12 @@ const SUBJECTS: [Subject; 3] = [
         requests: 16,
     },
 ];
-
 /// Program of a quick evaluation.
-const QUICK: Subject = Subject { fitted: &[0.25, 0.5, 1.0], held_back: &[0.75], requests: 6, ..SUBJECTS[0] };
+const QUICK: Subject = Subject { fitted: &[0.25, 0.5, 1.0], held_back: &[0.75], requests: 6, ..SLAM };
 
 /// One run in the cloud.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CoreLimitRun {
-    /// Cores of the servant that the kernel enforces.
     enforced: f64,
     trace: Trace,
     cost: RunCost,
@@ -81,39 +89,32 @@ pub struct CoreLimitRun {
 /// All runs of one program.
 pub struct ProgramStudy {
     subject: Subject,
-    /// Run on the robot itself, a Raspberry Pi in this evaluation.
-    native: CachedResult<Trace>,
-    /// Runs in the cloud, by the requested limit.
-    runs: Vec<(f64, CachedResult<CoreLimitRun>)>,
+    /// Runs on the robot itself, a Raspberry Pi in this evaluation.
+    native: Runs<Trace>,
+    runs: Vec<(f64, Runs<CoreLimitRun>)>,
 }
 
 /// Measures all programs; a quick evaluation measures one at few limits.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<Vec<ProgramStudy>> {
-    let subjects = if quick { vec![QUICK] } else { SUBJECTS.to_vec() };
-    subjects.into_iter().map(|subject| measure_study(cells, workshop, subject)).collect()
+    let subjects = if quick { &[QUICK][..] } else { &SUBJECTS };
+    subjects.iter().map(|subject| measure_study(cells, workshop, *subject)).collect()
 }
 
 fn measure_study(cells: &RunCache, workshop: &EvalFixtures, subject: Subject) -> Result<ProgramStudy> {
     let name = format!("cores {}", subject.name);
-    let native = cells.measure(&format!("{name} native"), &subject.requests, || measure_native(workshop, &subject))?;
+    let native = cells.repeat(&format!("{name} native"), &subject.requests, || {
+        let robot = (RobotHardware::PI, NETWORK);
+        let ran = workshop.run(&subject.example, ExecutionSite::Native, robot, |plan| plan.most = subject.requests);
+        Ok(ran?.0)
+    })?;
     let mut limits = [subject.fitted, subject.held_back].concat();
     limits.sort_by(f64::total_cmp);
-    let mut runs = Vec::new();
-    for cores in limits {
+    let measure = |cores: f64| {
         let of = (cores, subject.requests, subject.arguments);
-        let measured =
-            cells.measure(&format!("{name} {cores}"), &of, || measure_outsourced(workshop, &subject, cores))?;
-        runs.push((cores, measured));
-    }
-    Ok(ProgramStudy { subject, native, runs })
-}
-
-fn measure_native(workshop: &EvalFixtures, subject: &Subject) -> Result<Trace> {
-    let robot = (RobotHardware::PI, NETWORK);
-    let ran = workshop.run(&subject.example, ExecutionSite::Native, robot, |plan| {
-        plan.most = subject.requests;
-    });
-    Ok(ran?.0)
+        let measured = cells.repeat(&format!("{name} {cores}"), &of, || measure_outsourced(workshop, &subject, cores));
+        Ok((cores, measured?))
+    };
+    Ok(ProgramStudy { subject, native, runs: limits.into_iter().map(measure).collect::<Result<_>>()? })
 }
 
 /// Measures in the cloud. The robot's stub states the servant's cores; the enforced limit is read from the daemon while
@@ -129,8 +130,7 @@ fn measure_outsourced(workshop: &EvalFixtures, subject: &Subject, cores: f64) ->
         }
     })?;
     let servant = workshop.daemon.servant_of(subject.example.name, &robot)?;
-    let enforced = servant["enforced"]["cpus"].as_f64();
-    let enforced = enforced.context("the servant's cores are not limited")?;
+    let enforced = servant["enforced"]["cpus"].as_f64().context("the servant's cores are not limited")?;
     let id = servant["id"].as_str().context("a servant's id")?;
     // The servant's cores stay promised until it ends.
     workshop.daemon.deployer().run(&["stop", id])?.expect_success()?;
@@ -142,7 +142,6 @@ fn measure_outsourced(workshop: &EvalFixtures, subject: &Subject, cores: f64) ->
 /// Use of a limit in the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LimitUse {
-    /// The model is fitted to it.
     Fitted,
     /// Not used for fitting, but between limits that were.
     Inside,
@@ -151,7 +150,6 @@ enum LimitUse {
 }
 
 impl LimitUse {
-    /// Name in tables.
     fn name(self) -> &'static str {
         match self {
             Self::Fitted => "fitting",
@@ -173,44 +171,56 @@ impl Subject {
     }
 }
 
+/// Measurements at a limit.
+struct LimitPoint {
+    cores: f64,
+    purpose: LimitUse,
+    runs: Vec<ResponseParts>,
+}
+
+impl LimitPoint {
+    fn part(&self, index: usize) -> Option<Spread> {
+        Spread::from_values(&self.runs.iter().map(|parts| parts[index]).collect::<Vec<_>>())
+    }
+
+    fn whole(&self) -> Option<Spread> {
+        Spread::from_values(&self.runs.iter().map(|parts| parts.iter().sum()).collect::<Vec<f64>>())
+    }
+}
+
 /// Model and measurements of one program.
 struct ProgramFit<'a> {
     study: &'a ProgramStudy,
-    /// Cores, parts of the response time, and use in the model.
-    points: Vec<(f64, ResponseParts, LimitUse)>,
+    points: Vec<LimitPoint>,
     model: Option<Model>,
     /// Mean response time on the robot itself, in seconds.
-    native: Option<f64>,
+    native: Option<Spread>,
 }
 
 impl<'a> ProgramFit<'a> {
     fn from_study(study: &'a ProgramStudy) -> Self {
-        let mut points = Vec::new();
-        for (cores, measured) in &study.runs {
-            let parts = measured.value().and_then(|run| mean_parts(&run.trace));
-            let of = study.subject.use_of_limit(*cores);
-            points.extend(parts.map(|parts| (*cores, parts, of)));
-        }
-        let fitted = points.iter().filter(|point| point.2 == LimitUse::Fitted);
-        let fitted: Vec<(f64, ResponseParts)> = fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
-        let native = study.native.value().and_then(mean_parts);
-        Self { study, points, model: Model::fit(&fitted, study.subject.threads), native: native.map(total_time) }
+        let point = |(cores, measured): &(f64, Runs<CoreLimitRun>)| {
+            let runs: Vec<ResponseParts> = measured.done.iter().filter_map(|run| run.trace.mean_parts()).collect();
+            let purpose = study.subject.use_of_limit(*cores);
+            (!runs.is_empty()).then_some(LimitPoint { cores: *cores, purpose, runs })
+        };
+        let points: Vec<LimitPoint> = study.runs.iter().filter_map(point).collect();
+        let fitted = points.iter().filter(|point| point.purpose == LimitUse::Fitted);
+        let fitted: Vec<(f64, ResponseParts)> =
+            fitted.flat_map(|point| point.runs.iter().map(|parts| (point.cores, *parts))).collect();
+        let model = Model::fit(&fitted, study.subject.threads);
+        Self { study, points, model, native: study.native.figure(|trace| Some(trace.mean_parts()?.iter().sum())) }
     }
 
     fn name(&self) -> &'static str {
         self.study.subject.name
     }
 
-    /// Returns (predicted, measured) at the points with this use, for one of the model's predictions.
-    fn pairs(&self, of: LimitUse, predict: fn(&Model, f64) -> f64) -> Vec<(f64, f64)> {
-        let those = self.points.iter().filter(|point| point.2 == of);
-        let pair = |(cores, parts, _): &(f64, ResponseParts, LimitUse)| {
-            Some((predict(&self.model?, *cores), total_time(*parts)))
-        };
-        those.filter_map(pair).collect()
+    /// Returns the relative errors of one of the model's predictions at the points with this use.
+    fn errors(&self, purpose: LimitUse, predict: fn(&Model, f64) -> f64) -> Vec<f64> {
+        let those = self.points.iter().filter(|point| point.purpose == purpose);
+        those
+            .filter_map(|point| Some(predict(self.model.as_ref()?, point.cores) / point.whole()?.median - 1.0))
+            .collect()
     }
-}
-
-fn total_time(parts: ResponseParts) -> f64 {
-    parts.iter().sum()
 }

@@ -11,7 +11,7 @@ use support::binaries;
 use support::daemon::{Daemon, DaemonSetup};
 use support::robot::Robot;
 
-use crate::attempts;
+use crate::examples::publish_once;
 
 /// Directory below the checkout.
 const PACKAGE: &str = "eval/packages/worker_cpp";
@@ -23,7 +23,6 @@ const CONFIG: &str = "[servant]\nstart = \"2m\"\n";
 /// A service whose node computes on one core for a fixed time at each call of `/work`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorkerService {
-    /// Name of the service.
     pub name: &'static str,
     /// Core time per call, in milliseconds.
     pub milliseconds: u32,
@@ -40,14 +39,11 @@ pub const ENDLESS: WorkerService = WorkerService { name: "endless_work", millise
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
-    /// The daemon's default.
     On,
-    /// Limits stay as requested.
     Off,
 }
 
 impl Controller {
-    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::On => "on",
@@ -97,22 +93,14 @@ impl CrowdDaemon {
 
 /// Publishes a service, unless it has been published, or has failed, before.
 pub fn publish(daemon: &Daemon, service: WorkerService) -> Result<()> {
-    let services = daemon.deployer().run_json(&["services"])?;
-    let known = |all: &Vec<Value>| all.iter().any(|one| one["name"] == service.name);
-    if services.as_array().is_some_and(known) {
-        return Ok(());
-    }
-    attempts::try_once(service.name, || push(daemon, service))
-}
-
-fn push(daemon: &Daemon, service: WorkerService) -> Result<()> {
-    let package = binaries::checkout().join(PACKAGE);
-    let package = package.to_str().context("a path of UTF-8")?;
-    let milliseconds = format!("milliseconds={}", service.milliseconds);
-    let push = ["push", package, "--name", service.name, "--node", EXECUTABLE];
-    let push = [&push[..], &["--param", &milliseconds]].concat();
-    daemon.deployer().run(&push)?.expect_success()?;
-    Ok(())
+    publish_once(daemon, service.name, || {
+        let package = binaries::checkout().join(PACKAGE);
+        let package = package.to_str().context("a path of UTF-8")?;
+        let milliseconds = format!("milliseconds={}", service.milliseconds);
+        let push = ["push", package, "--name", service.name, "--node", EXECUTABLE, "--param", &milliseconds];
+        daemon.deployer().run(&push)?.expect_success()?;
+        Ok(())
+    })
 }
 
 /// Connects a robot and waits for its servant. `states` is appended to its query, such as `&cpus=0.5`.
@@ -131,7 +119,6 @@ pub fn time_call(robot: &mut Robot) -> Result<f64> {
     Ok(took)
 }
 
-/// Starts a call without waiting for the answer.
 pub fn begin_call(robot: &mut Robot) -> Result<()> {
     robot.send(json!({"op": "call_service", "service": "/work", "args": {}}))
 }
@@ -170,7 +157,6 @@ pub fn usage(daemon: &Daemon, service: WorkerService) -> Result<(f64, f64)> {
     Ok(sum)
 }
 
-/// Number of cores of this machine.
 pub fn cores() -> f64 {
     std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
 }

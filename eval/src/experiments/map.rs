@@ -6,39 +6,49 @@ mod picture;
 use anyhow::{Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::{RunCache, Runs};
 use crate::examples::{EvalFixtures, EvalPackage, ExecutionSite, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED};
 use crate::place::{NetworkProfile, RobotHardware, RunCost};
 use crate::plots::{self, Series};
 use crate::recording::Recording;
 use crate::robot::RequestPacing;
-use crate::section::{AGAIN, Figure, MissingMeasurement, Section, Table};
-use crate::statistics::trajectory_error;
+use crate::section::{About, Figure, Section, Table};
+use crate::statistics::{TrajectoryError, trajectory_error};
 use crate::trace::{MapGrid, Trace};
-use crate::words::{digits, or_dash, percent};
+use crate::words::{count, digits, percent, spread};
 
 /// Topic of the reference in the recording.
 const REFERENCE: &str = "/ground_truth";
-/// Rate of the publication.
-const SLOWLY: f64 = 0.33;
 
-/// Ratio of distances up to which they count as equal.
-const ALIKE: f64 = 1.2;
+/// The experiment.
+pub const ABOUT: About = About {
+    number: 7,
+    id: "map",
+    title: "The map of a drive",
+    published: "Fig. 8 of the publication: a real robot drives, and its map is made on the robot and in the cloud; the \
+        recording was also played at 0.33 of its rate.",
+    differs: &[
+        "The real drive is a recording of MRPT; its reference is the path by MRPT's own SLAM, afterwards, so that what \
+         both get wrong is not seen. The simulated one (MRPT's simul.rawlog, its first 760 scans, 80 m) has a true \
+         path.",
+        "Paths are compared after one is turned and moved onto the other (absolute trajectory error).",
+        "The robot is of the class Pi, by Wi-Fi (5 ms each way, more or less 4 ms, 40 Mbit/s, one packet in a hundred \
+         lost). The native robot and the stub's drive at the same time, in places of their own.",
+    ],
+};
 
 /// A drive, and the reference for its errors.
 struct Drive {
-    /// Prefix of figure ids.
     id: &'static str,
-    /// Package, with its recording.
     example: EvalPackage,
-    /// Title in tables and captions.
     title: &'static str,
     /// Origin of the path on [`REFERENCE`].
     whose: &'static str,
-    /// Short form for sentences and column heads.
+    /// Name of that path in column heads, and published figures.
     reference: &'static str,
+    published: &'static str,
     /// Rates at which the drive is played, and the names of the runs on the robot and through the stub.
-    plays: &'static [(f64, &'static str, &'static str)],
+    plays: &'static [(f64, [&'static str; 2])],
 }
 
 /// The real drive has no independent ground truth.
@@ -49,9 +59,10 @@ const DRIVES: [Drive; 2] = [
         title: "a real drive",
         whose: "MRPT's own SLAM, afterwards",
         reference: "reference",
+        published: "drawn only",
         plays: &[
-            (1.0, "native, own rate", "stub, own rate"),
-            (SLOWLY, "native, 0.33 of its rate", "stub, 0.33 of its rate"),
+            (1.0, ["native, own rate", "stub, own rate"]),
+            (0.33, ["native, 0.33 of its rate", "stub, 0.33 of its rate"]),
         ],
     },
     Drive {
@@ -60,7 +71,8 @@ const DRIVES: [Drive; 2] = [
         title: "a simulated drive",
         whose: "the simulator's exact path",
         reference: "truth",
-        plays: &[(1.0, "native, simulated drive", "stub, simulated drive")],
+        published: "none",
+        plays: &[(1.0, ["native, simulated drive", "stub, simulated drive"])],
     },
 ];
 
@@ -73,18 +85,24 @@ pub struct MapPlay {
     truth: Vec<(f64, f64, f64)>,
 }
 
-/// Results of all plays.
-pub struct MapRuns {
-    plays: Vec<(String, CachedResult<MapPlay>)>,
+impl MapPlay {
+    fn error(&self) -> Option<TrajectoryError> {
+        trajectory_error(&self.trace.trajectory(), &self.truth)
+    }
 }
 
+/// Results of all plays, by name.
+pub struct MapRuns(Vec<(&'static str, Runs<MapPlay>)>);
+
 impl MapRuns {
+    fn find(&self, name: &str) -> Option<&Runs<MapPlay>> {
+        self.0.iter().find(|(one, _)| *one == name).map(|(_, runs)| runs)
+    }
+
     /// Returns the plays of one drive that were attempted.
-    fn for_drive<'a>(&'a self, drive: &Drive) -> impl Iterator<Item = &'a (String, CachedResult<MapPlay>)> {
-        let plays = drive.plays;
-        self.plays.iter().filter(move |(name, _)| {
-            plays.iter().any(|(_, native, stub)| [native, stub].iter().any(|one| *one == name))
-        })
+    fn plays_of(&self, drive: &Drive) -> impl Iterator<Item = (&'static str, &Runs<MapPlay>)> {
+        let names = drive.plays.iter().flat_map(|(_, names)| *names);
+        names.filter_map(move |name| Some((name, self.find(name)?)))
     }
 }
 
@@ -93,87 +111,63 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -
     let mut plays = Vec::new();
     let drives = if most.is_some() { &DRIVES[..1] } else { &DRIVES };
     for drive in drives {
+        let rates = if most.is_some() { &drive.plays[..1] } else { drive.plays };
         // Created first, because both runs need it at the same time.
         if let Err(error) = workshop.recording(drive.example.input) {
-            let why = format!("{error:#}");
-            let names = drive.plays.iter().flat_map(|(_, native, stub)| [native, stub]);
-            plays.extend(names.map(|name| ((*name).to_owned(), CachedResult::Missing(why.clone()))));
+            let names = rates.iter().flat_map(|(_, names)| *names);
+            plays.extend(names.map(|name| (name, Runs::from_failure(format!("{error:#}")))));
             continue;
         }
-        let all = if most.is_some() { 1 } else { drive.plays.len() };
-        for (speed, native, stub) in &drive.plays[..all] {
+        for (speed, names) in rates {
+            let of = (RobotHardware::PI, speed, most);
+            let play = |name: &str, at: ExecutionSite| {
+                cells.repeat(&format!("map {name}"), &of, || play_drive(workshop, drive, at, *speed, most))
+            };
             // Both robots drive at the same time: each has its own share of the processor, and together with the cloud
             // they need less than two cores.
-            let play = |name: &str, at: ExecutionSite| measure_play(cells, workshop, drive, (name, at), *speed, most);
             let both = std::thread::scope(|scope| {
-                let beside = scope.spawn(|| play(stub, ExecutionSite::Outsourced));
-                let native = play(native, ExecutionSite::Native);
-                let stub = beside.join().unwrap_or_else(|_| Err(anyhow!("the stub's robot panicked")));
-                [native, stub]
+                let beside = scope.spawn(|| play(names[1], ExecutionSite::Outsourced));
+                let native = play(names[0], ExecutionSite::Native);
+                [native, beside.join().unwrap_or_else(|_| Err(anyhow!("the stub's robot panicked")))]
             });
-            for (name, play) in [native, stub].into_iter().zip(both) {
-                plays.push(((*name).to_owned(), play?));
+            for (name, play) in names.iter().zip(both) {
+                plays.push((*name, play?));
             }
         }
     }
-    Ok(MapRuns { plays })
+    Ok(MapRuns(plays))
 }
 
-fn measure_play(
-    cells: &RunCache,
+fn play_drive(
     workshop: &EvalFixtures,
     drive: &Drive,
-    (name, at): (&str, ExecutionSite),
+    at: ExecutionSite,
     speed: f64,
     most: Option<usize>,
-) -> Result<CachedResult<MapPlay>> {
-    cells.measure(&format!("map {name}"), &(RobotHardware::PI, speed, most), || {
-        let input = drive.example.input;
-        let truth = Recording::read(&workshop.recording(input)?)?.positions(REFERENCE);
-        let robot = (RobotHardware::PI, NetworkProfile::Wifi);
-        let (trace, cost) = workshop.run(&drive.example, at, robot, |plan| {
-            plan.pace = RequestPacing::Recorded(speed);
-            plan.most = most.unwrap_or(match input {
-                InputRecording::Simulated => drive.example.requests,
-                _ => usize::MAX,
-            });
-            plan.patience = 1200.0;
-        })?;
-        Ok(MapPlay { trace, cost, truth })
-    })
+) -> Result<MapPlay> {
+    let input = drive.example.input;
+    let truth = Recording::read(&workshop.recording(input)?)?.positions(REFERENCE);
+    let all = if input == InputRecording::Simulated { drive.example.requests } else { usize::MAX };
+    let (trace, cost) = workshop.run(&drive.example, at, (RobotHardware::PI, NetworkProfile::Wifi), |plan| {
+        plan.pace = RequestPacing::Recorded(speed);
+        plan.most = most.unwrap_or(all);
+        plan.give_up = 10.0;
+        plan.patience = 1200.0;
+    })?;
+    Ok(MapPlay { trace, cost, truth })
 }
 
-/// Creates the section of the report.
-pub fn section(runs: &MapRuns) -> Result<Section> {
-    let mut section = Section::new(7, "map", "The map of a drive");
-    section.published = "Fig. 8 of the publication: a real robot drives, and its map is made on the robot and in the \
-        cloud; the recording was also played at 0.33 of its rate."
-        .to_owned();
-    section.differs = vec![
-        format!("The reference of all errors of the real drive is the path by {}, of the same recording: there is no \
-            independent ground truth of this drive, so that what both get wrong is not seen.", DRIVES[0].whose),
-        format!("The simulated drive is there for an error against a true path: {}. It is no robot's, its scans and \
-            odometry are a simulator's (MRPT's simul.rawlog, the first {} scans, 80 m that end close to where they \
-            began), played once at its own rate.", DRIVES[1].whose, DRIVES[1].example.requests),
-        "Paths are compared after one is turned and moved onto the other, as they begin nowhere in common (absolute \
-         trajectory error).".to_owned(),
-        "The robot is a recording of MRPT, played at its own rate to a robot of the class Pi, by Wi-Fi (5 ms each way, \
-         more or less 4 ms, 40 Mbit/s, one packet in a hundred lost). The native robot and the stub's drive at the \
-         same time, in places of their own.".to_owned(),
-    ];
-    for drive in &DRIVES {
-        // A quick evaluation does not play every drive.
-        if runs.for_drive(drive).next().is_none() {
-            continue;
-        }
-        add_drive(&mut section, runs, drive)?;
+/// Creates the section of the report. A drive that was not played does not appear.
+pub fn section(runs: &MapRuns) -> Section {
+    let mut section = ABOUT.section();
+    for drive in DRIVES.iter().filter(|drive| runs.plays_of(drive).next().is_some()) {
+        add_drive(&mut section, runs, drive);
         add_findings(&mut section, runs, drive);
     }
-    Ok(section)
+    section
 }
 
-/// Adds a drive's table, paths and maps.
-fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()> {
+fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) {
     let mut table = Table::new(
         format!("laser_slam on a robot of the class Pi: {}", drive.title),
         &format!(
@@ -184,114 +178,91 @@ fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()>
     );
     let mut paths = Vec::new();
     let mut maps: Vec<(&str, &MapGrid)> = Vec::new();
-    for (name, play) in runs.for_drive(drive) {
-        let Some(play) = play.require(section, name, AGAIN) else {
+    for (name, plays) in runs.plays_of(drive) {
+        let Some(first) = plays.require(section, name) else {
             continue;
         };
-        let (trace, estimate) = (&play.trace, play.trace.trajectory());
-        let error = trajectory_error(&estimate, &play.truth);
-        let metres = |value| or_dash(value, digits);
         table.push([
-            name.clone(),
-            trace.requests.len().to_string(),
-            trace.answered_count().to_string(),
-            percent(Some(processed_share(trace))),
-            metres(error.as_ref().map(|error| error.rmse)),
-            metres(error.as_ref().map(|error| error.max)),
-            match drive.example.input {
-                InputRecording::Simulated => "none".to_owned(),
-                _ => "drawn only".to_owned(),
-            },
+            name.to_owned(),
+            count(plays.figure(|play| Some(play.trace.requests.len() as f64))),
+            count(plays.figure(|play| Some(play.trace.answered_count() as f64))),
+            percent(plays.figure(processed_share)),
+            spread(plays.figure(|play| Some(play.error()?.rmse)), digits),
+            spread(plays.figure(|play| Some(play.error()?.max)), digits),
+            drive.published.to_owned(),
         ]);
-        section.note_early_end(format!("{name}: to its end"), trace);
-        if paths.is_empty() && !play.truth.is_empty() {
-            let last = trace.requests.last().map_or(0.0, |last| last.stamp);
-            let driven = play.truth.iter().filter(|(at, _, _)| *at <= last);
-            paths.push(path_series(drive.whose, &driven.copied().collect::<Vec<_>>()));
+        plays.done.iter().for_each(|play| section.note_early_end(name, &play.trace));
+        if paths.is_empty() && !first.truth.is_empty() {
+            let last = first.trace.requests.last().map_or(0.0, |last| last.stamp);
+            let driven = first.truth.iter().filter(|(at, _, _)| *at <= last);
+            paths.push(path_series(drive.whose, driven));
         }
-        paths.push(path_series(name, &estimate));
-        maps.extend(trace.map.as_ref().map(|map| (name.as_str(), map)));
+        paths.push(path_series(name, &first.trace.trajectory()));
+        maps.extend(first.trace.map.as_ref().map(|map| (name, map)));
     }
     section.tables.push(table);
     section.add_drawing(
         format!("paths-{}", drive.id),
-        format!("Where the robot was, by each: {}", drive.title),
-        plots::map("laser_slam", "x, m", "y, m", &paths)?,
+        format!("Where the robot was, by the first run of each: {}", drive.title),
+        plots::map("laser_slam", "x, m", "y, m", &paths),
     );
-    if !maps.is_empty() {
-        let (names, grids): (Vec<&str>, Vec<&MapGrid>) = maps.into_iter().unzip();
-        let caption = format!(
-            "The maps of {}, two in a row: {}. All show the same place; the bars are {} m long.",
-            drive.title,
-            names.join("; "),
-            picture::BAR
-        );
-        match picture::draw_maps(&grids) {
-            Ok(drawn) => section.figures.push(Figure::png(format!("maps-{}", drive.id), caption, drawn)),
-            Err(error) => section.missing.push(MissingMeasurement::new(
-                format!("the maps of {}", drive.title),
-                format!("{error:#}"),
-                "look at what the node printed",
-            )),
-        }
+    if maps.is_empty() {
+        return;
     }
-    Ok(())
+    let (names, grids): (Vec<&str>, Vec<&MapGrid>) = maps.into_iter().unzip();
+    let title = format!("The maps of {}", drive.title);
+    match picture::draw_maps(&grids) {
+        Ok(drawn) => {
+            let (names, bar) = (names.join("; "), picture::BAR);
+            let caption =
+                format!("{title}, two in a row: {names}. All show the same place; the bars are {bar} m long.");
+            section.figures.push(Figure::png(format!("maps-{}", drive.id), caption, drawn));
+        }
+        Err(error) => section.add_missing(title, format!("{error:#}"), "look at what the node printed"),
+    }
 }
 
 fn add_findings(section: &mut Section, runs: &MapRuns, drive: &Drive) {
-    let of = |name: &str| {
-        let (_, play) = runs.plays.iter().find(|(one, _)| one == name)?;
-        let play = play.value()?;
-        let error = trajectory_error(&play.trace.trajectory(), &play.truth);
-        Some((&play.trace, error.map(|error| error.rmse)))
-    };
-    let said = |error: Option<f64>| {
-        error.map_or_else(
-            || "without a path to compare".to_owned(),
-            |error| format!("{} m from the {}, RMS", digits(error), drive.reference),
-        )
-    };
-    for (speed, native, stub) in drive.plays {
-        let (Some((alone, error)), Some((through, stubs_error))) = (of(native), of(stub)) else {
+    for (speed, [native, stub]) in drive.plays {
+        let (Some(native), Some(stub)) = (runs.find(native), runs.find(stub)) else {
             continue;
         };
-        let farther = error.zip(stubs_error).is_some_and(|(alone, stub)| stub > alone * ALIKE);
-        let worse = if has_fewer_scans(through, alone) {
+        let [alone, through] = [native, stub].map(|plays| plays.figure(processed_share));
+        let [error, stubs_error] = [native, stub].map(|plays| plays.figure(|play| Some(play.error()?.rmse)));
+        let is_farther = stubs_error.zip(error).is_some_and(|(stub, alone)| stub.is_above(alone));
+        let worse = if native.compare(stub, count_fewer_scans).is_some_and(|fewer| fewer.median > 0.0) {
             "; fewer through the stub is worse than hoped: what the network loses and delays comes to more than what \
              its processor saves"
-        } else if farther {
-            "; the greater distance through the stub is worse than hoped, and not explained by the share: of one run \
-             each, it may be the package's own difference between one choice of scans and another"
+        } else if is_farther {
+            "; the greater distance through the stub is worse than hoped"
         } else {
             ""
         };
-        let (error, stubs_error) = (said(error), said(stubs_error));
-        let rate = match *speed {
-            1.0 => "its own rate".to_owned(),
-            speed => format!("{speed} of its own rate"),
-        };
-        let [alone, through] = [alone, through].map(|trace| percent(Some(processed_share(trace))));
+        let [alone, through] = [alone, through].map(percent);
+        let [error, stubs_error] = [error, stubs_error].map(|error| spread(error, digits));
         section.findings.push(format!(
-            "Of {}, at {rate}, the robot works at {alone} of the scans by itself ({error}), and at {through} through \
-             the stub ({stubs_error}){worse}.",
-            drive.title
+            "Of {}, at {speed} of its own rate, the robot works at {alone} of the scans by itself ({error} m from the \
+             {reference}, RMS), and at {through} through the stub ({stubs_error} m){worse}.",
+            drive.title,
+            reference = drive.reference
         ));
     }
 }
 
 /// Returns the fraction of scans that were processed.
-fn processed_share(trace: &Trace) -> f64 {
-    trace.answered_count() as f64 / trace.requests.len().max(1) as f64
+fn processed_share(play: &MapPlay) -> Option<f64> {
+    Some(play.trace.answered_count() as f64 / play.trace.requests.len().max(1) as f64)
 }
 
-/// Returns whether fewer scans were processed through the stub, by more than one scan and by more than one per cent.
-fn has_fewer_scans(through: &Trace, alone: &Trace) -> bool {
-    let all = alone.requests.len().max(through.requests.len()) as f64;
-    all * (processed_share(alone) - processed_share(through)) > f64::max(1.5, all / 100.0)
+/// Returns how many scans fewer were processed through the stub; 0 unless more than one, and more than one per cent.
+fn count_fewer_scans(alone: &MapPlay, through: &MapPlay) -> Option<f64> {
+    let all = alone.trace.requests.len().max(through.trace.requests.len()) as f64;
+    let fewer = all * (processed_share(alone)? - processed_share(through)?);
+    Some(if fewer > f64::max(1.5, all / 100.0) { fewer } else { 0.0 })
 }
 
-fn path_series(name: &str, path: &[(f64, f64, f64)]) -> Series {
-    Series { name: name.to_owned(), points: path.iter().map(|(_, x, y)| (*x, *y)).collect() }
+fn path_series<'a>(name: &str, path: impl IntoIterator<Item = &'a (f64, f64, f64)>) -> Series {
+    Series::new(name, path.into_iter().map(|(_, x, y)| (*x, *y)).collect())
 }
 
 #[cfg(test)]
@@ -299,6 +270,8 @@ mod tests {
     use super::*;
     use crate::trace::RequestSample;
     use crate::words::assert_tells;
+
+    const HERE: Option<[f64; 3]> = Some([0.0, 0.0, 0.0]);
 
     fn play(poses: &[Option<[f64; 3]>]) -> MapPlay {
         let request = |(number, pose): (u32, &Option<[f64; 3]>)| RequestSample {
@@ -314,72 +287,48 @@ mod tests {
         }
     }
 
-    #[test]
-    fn scans_that_were_not_worked_at_are_counted() {
-        let half = play(&[Some([0.0, 0.0, 0.0]), None, Some([2.0, 0.0, 0.0]), None]);
-        let runs = MapRuns { plays: vec![("native, own rate".to_owned(), CachedResult::Done(half))] };
-        let section = section(&runs).expect("a section");
-        assert_eq!(section.tables[0].rows[0][1..4], ["4", "2", "50.0 %"].map(str::to_owned));
+    /// Returns the section of a drive that was played natively and through the stub.
+    fn section_of(names: [&'static str; 2], plays: [&MapPlay; 2]) -> Section {
+        let plays = names.into_iter().zip(plays.map(|play| Runs::from(play.clone())));
+        section(&MapRuns(plays.collect()))
     }
 
     #[test]
-    fn a_stub_that_works_at_fewer_scans_is_told() {
-        let here = Some([0.0, 0.0, 0.0]);
-        let whole = play(&[here, Some([1.0, 0.0, 0.0]), here, here]);
-        let half = play(&[here, None, here, None]);
-        let [native, stub] = [DRIVES[0].plays[1].1, DRIVES[0].plays[1].2].map(str::to_owned);
-        let runs = MapRuns { plays: vec![(native, CachedResult::Done(whole)), (stub, CachedResult::Done(half))] };
-        let section = section(&runs).expect("a section");
+    fn scans_that_were_not_worked_at_are_counted_and_told() {
+        let whole = play(&[HERE, Some([1.0, 0.0, 0.0]), HERE, HERE]);
+        let half = play(&[HERE, None, HERE, None]);
+        let section = section_of(DRIVES[0].plays[1].1, [&whole, &half]);
+        assert_eq!(section.tables[0].rows[1][1..4], ["4", "2", "50.0 %"]);
         assert_eq!(section.findings.len(), 1);
-        let told = &section.findings[0];
         for words in ["at 0.33", "100.0 % of the scans by itself (", "50.0 % through the stub (", "worse than hoped"] {
-            assert_tells(told, words);
+            assert_tells(&section.findings[0], words);
         }
     }
 
     #[test]
     fn one_scan_is_no_difference() {
         let of = |answered: usize, all: usize| {
-            let mut poses = vec![Some([0.0, 0.0, 0.0]); answered];
+            let mut poses = vec![HERE; answered];
             poses.resize(all, None);
-            play(&poses).trace
+            play(&poses)
         };
-        assert!(!has_fewer_scans(&of(221, 222), &of(222, 222)));
-        assert!(!has_fewer_scans(&of(3, 4), &of(4, 4)));
-        assert!(!has_fewer_scans(&of(997, 1000), &of(1000, 1000)));
-        assert!(has_fewer_scans(&of(219, 222), &of(222, 222)));
-        assert!(!has_fewer_scans(&of(222, 222), &of(150, 222)));
-        assert_eq!(percent(Some(processed_share(&of(221, 222)))), "99.5 %");
+        let fewer = |through: (usize, usize), alone: (usize, usize)| {
+            count_fewer_scans(&of(alone.0, alone.1), &of(through.0, through.1)).expect("scans") > 0.0
+        };
+        assert!(!fewer((221, 222), (222, 222)) && !fewer((3, 4), (4, 4)) && !fewer((997, 1000), (1000, 1000)));
+        assert!(fewer((219, 222), (222, 222)) && !fewer((222, 222), (150, 222)));
     }
 
     #[test]
-    fn a_stub_that_is_farther_off_is_told() {
-        let straight = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
-        let stretched = play(&[Some([0.0, 0.0, 0.0]), Some([3.0, 0.0, 0.0])]);
-        let (_, native, stub) = DRIVES[1].plays[0];
-        let told = |native_run: &MapPlay, stub_run: &MapPlay| {
-            let runs = [(native, native_run), (stub, stub_run)];
-            let runs = runs.map(|(name, run)| (name.to_owned(), CachedResult::Done(run.clone())));
-            let plays = runs.to_vec();
-            section(&MapRuns { plays }).expect("a section").findings[0].clone()
-        };
-        assert!(told(&straight, &stretched).contains("worse than hoped"));
-        assert!(!told(&stretched, &straight).contains("worse than hoped"));
-    }
-
-    #[test]
-    fn an_error_against_a_true_path_is_told_as_such() {
-        let whole = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
-        let (_, native, stub) = DRIVES[1].plays[0];
-        let runs =
-            MapRuns { plays: [native, stub].map(|name| (name.to_owned(), CachedResult::Done(whole.clone()))).to_vec() };
-        let section = section(&runs).expect("a section");
+    fn errors_are_told_by_their_reference() {
+        let straight = play(&[HERE, Some([1.0, 0.0, 0.0])]);
+        let stretched = play(&[HERE, Some([3.0, 0.0, 0.0])]);
+        let told = |plays| section_of(DRIVES[1].plays[0].1, plays).findings[0].clone();
+        assert_tells(&told([&straight, &stretched]), "a simulated drive, at 1 of its own rate,");
+        assert_tells(&told([&straight, &stretched]), "(0.00 m from the truth, RMS)");
+        assert_tells(&told([&straight, &stretched]), "worse than hoped");
+        assert!(!told([&stretched, &straight]).contains("worse than hoped"));
         // A drive that was not played does not appear.
-        assert_eq!(section.tables.len(), 1);
-        assert_eq!(section.tables[0].rows.len(), 2);
-        let told = &section.findings[0];
-        for words in ["a simulated drive, at its own rate,", "(0.00 m from the truth, RMS)"] {
-            assert_tells(told, words);
-        }
+        assert_eq!(section_of(DRIVES[1].plays[0].1, [&straight, &straight]).tables.len(), 1);
     }
 }

@@ -6,10 +6,23 @@ mod isolation;
 
 use anyhow::Result;
 
-use crate::cells::RunCache;
-use crate::section::Section;
-
 use super::crowd::CrowdDaemon;
+use crate::cells::RunCache;
+use crate::section::{About, Section};
+
+/// The experiment.
+pub const ABOUT: About = About {
+    number: 9,
+    id: "neighbours",
+    title: "Robots beside each other",
+    published: "Robots have servants of their own in the publication, which are isolated from one another; no \
+        published figure is repeated here.",
+    differs: &[
+        "The services compute for a known time of a core at each call (eval/packages/worker_cpp), so that what is \
+         beyond it is waiting. Robots are WebSocket clients on the same machine.",
+        "With fewer greedy neighbours than cores nobody has to wait: on more than nine cores this shows nothing.",
+    ],
+};
 
 /// Results of both parts.
 pub struct NeighbourRuns {
@@ -19,33 +32,13 @@ pub struct NeighbourRuns {
 
 /// Measures both parts; with `quick`, few points for a short time each.
 pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<NeighbourRuns> {
-    Ok(NeighbourRuns {
-        isolation: isolation::measure(cells, yard, quick)?,
-        agreements: agreements::measure(cells, yard, quick)?,
-    })
+    let isolation = isolation::measure(cells, yard, quick)?;
+    Ok(NeighbourRuns { isolation, agreements: agreements::measure(cells, yard, quick)? })
 }
 
-/// Creates the section of the report.
-pub fn section(runs: &NeighbourRuns) -> Result<Section> {
-    let mut section = Section::new(9, "neighbours", "Robots beside each other");
-    section.published =
-        "Robots have servants of their own in the publication, which are isolated from one another; no \
-        published figure is \
-                         repeated here."
-            .to_owned();
-    section.differs = vec![
-        "The services compute for a known time of a core at each call (eval/packages/worker_cpp), so that what is \
-         beyond it is waiting. \
-         Robots are WebSocket clients on the same machine."
-            .to_owned(),
-        "With fewer greedy neighbours than cores nobody has to wait: on a machine of more than nine cores this \
-         experiment shows nothing."
-            .to_owned(),
-    ];
-    isolation::add_to_section(&runs.isolation, &mut section)?;
-    agreements::add_to_section(&runs.agreements, &mut section)?;
-    Ok(section)
+pub fn section(runs: &NeighbourRuns) -> Section {
+    let mut section = ABOUT.section();
+    isolation::add_to_section(&runs.isolation, &mut section);
+    agreements::add_to_section(&runs.agreements, &mut section);
+    section
 }
-
-/// Next step for missing measurements.
-const AGAIN: &str = "make eval ONLY=9 tries it again";

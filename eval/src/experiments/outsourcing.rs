@@ -8,27 +8,24 @@ mod response_times;
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::{RunCache, Runs};
 use crate::examples::{ALL, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
 use crate::place::{NetworkProfile, RobotHardware, RunCost};
-use crate::section::{AGAIN, Section};
+use crate::section::Section;
 use crate::trace::Trace;
 
-pub use jitter::jitter;
-pub use phases::phases;
-pub use response_times::response_times;
+pub use jitter::{JITTER, jitter};
+pub use phases::{PHASES, phases};
+pub use response_times::{RESPONSE_TIMES, response_times};
 
 /// Place where a package ran.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum OutsourcingSetUp {
-    /// On the robot.
     Native,
-    /// In the cloud, over this network.
     Behind(NetworkProfile),
 }
 
 impl OutsourcingSetUp {
-    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Native => "native",
@@ -38,7 +35,7 @@ impl OutsourcingSetUp {
 }
 
 /// Set-ups of the published figure.
-pub const SET_UPS: [OutsourcingSetUp; 3] = [
+const SET_UPS: [OutsourcingSetUp; 3] = [
     OutsourcingSetUp::Native,
     OutsourcingSetUp::Behind(NetworkProfile::Lan),
     OutsourcingSetUp::Behind(NetworkProfile::Wan),
@@ -46,14 +43,26 @@ pub const SET_UPS: [OutsourcingSetUp; 3] = [
 
 /// One package on one robot in one set-up.
 pub struct OutsourcingRun {
-    /// The package.
-    pub example: EvalPackage,
-    /// The robot.
-    pub class: RobotHardware,
-    /// Place where it ran.
-    pub set_up: OutsourcingSetUp,
-    /// Result.
-    pub measured: CachedResult<(Trace, RunCost)>,
+    example: EvalPackage,
+    class: RobotHardware,
+    set_up: OutsourcingSetUp,
+    measured: Runs<(Trace, RunCost)>,
+}
+
+impl OutsourcingRun {
+    fn labels(&self) -> [&'static str; 3] {
+        [self.example.name, self.class.name(), self.set_up.name()]
+    }
+
+    fn place_name(&self) -> String {
+        format!("{}, {}", self.class.name(), self.set_up.name())
+    }
+
+    /// Returns the same package on the same robot, natively.
+    fn native<'a>(&self, runs: &'a [Self]) -> Option<&'a Self> {
+        let is_native = |run: &&Self| run.set_up == OutsourcingSetUp::Native;
+        runs.iter().filter(is_native).find(|run| run.example.name == self.example.name && run.class == self.class)
+    }
 }
 
 /// Measures all runs with `most` requests each, or as many as the example specifies.
@@ -70,11 +79,11 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -
             for set_up in SET_UPS {
                 let name = format!("{} {} {}", example.name, class.name(), set_up.name());
                 let most = most.unwrap_or(example.requests).min(example.requests);
-                let measured = cells.measure(&name, &(class, set_up, most), || {
-                    let (at, network) = match set_up {
-                        OutsourcingSetUp::Native => (ExecutionSite::Native, NetworkProfile::Lan),
-                        OutsourcingSetUp::Behind(network) => (ExecutionSite::Outsourced, network),
-                    };
+                let (at, network) = match set_up {
+                    OutsourcingSetUp::Native => (ExecutionSite::Native, NetworkProfile::Lan),
+                    OutsourcingSetUp::Behind(network) => (ExecutionSite::Outsourced, network),
+                };
+                let measured = cells.repeat(&name, &(class, set_up, most), || {
                     workshop.run(&example, at, (class, network), |plan| plan.most = most)
                 })?;
                 runs.push(OutsourcingRun { example, class, set_up, measured });
@@ -84,67 +93,40 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -
     Ok(runs)
 }
 
-/// Returns the result of one package, robot and set-up.
-fn find_run<'a>(
-    runs: &'a [OutsourcingRun],
-    example: &str,
-    class: RobotHardware,
-    set_up: OutsourcingSetUp,
-) -> Option<&'a (Trace, RunCost)> {
-    let wanted = |run: &&OutsourcingRun| run.example.name == example && run.class == class && run.set_up == set_up;
-    runs.iter().find(wanted)?.measured.value()
-}
-
-/// Returns the packages of these runs.
 fn examples(runs: &[OutsourcingRun]) -> impl Iterator<Item = EvalPackage> {
-    let tried = |example: &EvalPackage| runs.iter().any(|run| run.example.name == example.name);
-    ALL.into_iter().filter(tried)
+    ALL.into_iter().filter(|example| runs.iter().any(|run| run.example.name == example.name))
 }
 
-/// Lists the runs without a result.
-fn add_missing<R: std::borrow::Borrow<OutsourcingRun>>(section: &mut Section, runs: &[R]) {
-    for run in runs.iter().map(std::borrow::Borrow::borrow) {
-        let what = format!("{}, {}, {}", run.example.name, run.class.name(), run.set_up.name());
-        if let Some((trace, _)) = run.measured.require(section, &what, AGAIN) {
-            let answered = trace.requests.len();
-            section.note_early_end(format!("{what}: after request {answered}"), trace);
-        }
+fn add_missing<'a>(section: &mut Section, runs: impl IntoIterator<Item = &'a OutsourcingRun>) {
+    for run in runs {
+        let what = run.labels().join(", ");
+        run.measured.require(section, &what);
+        run.measured.done.iter().for_each(|(trace, _)| section.note_early_end(&what, trace));
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::examples::LASER_SLAM;
     use crate::trace::{ComputationPhases, RequestSample};
 
     /// Creates a run of one package on the smaller robot with these response times, in seconds.
     pub(super) fn test_run(set_up: OutsourcingSetUp, responses: &[f64]) -> OutsourcingRun {
-        let request = |response: &f64| RequestSample {
-            response: Some(*response),
-            phases: Some(ComputationPhases {
-                acquisition: response * 0.1,
-                computation: response * 0.5,
-                rendering: response * 0.2,
-            }),
-            ..RequestSample::default()
+        let request = |response: &f64| {
+            let [acquisition, computation, rendering] = [0.1, 0.5, 0.2].map(|share| response * share);
+            let phases = Some(ComputationPhases { acquisition, computation, rendering });
+            RequestSample { response: Some(*response), phases, ..RequestSample::default() }
         };
         let trace = Trace { requests: responses.iter().map(request).collect(), ..Trace::default() };
-        OutsourcingRun {
-            example: LASER_SLAM,
-            class: RobotHardware::PI,
-            set_up,
-            measured: CachedResult::Done((trace, RunCost::default())),
-        }
+        let measured = Runs::from((trace, RunCost::default()));
+        OutsourcingRun { example: LASER_SLAM, class: RobotHardware::PI, set_up, measured }
     }
 
     #[test]
     fn what_was_not_measured_is_named() {
-        let lost = OutsourcingRun {
-            measured: CachedResult::Missing("the robot's place was ended by signal 9".to_owned()),
-            ..test_run(OutsourcingSetUp::Native, &[])
-        };
-        let section = jitter(&[lost]).expect("a section");
+        let measured = Runs::from_failure("the robot's place was ended by signal 9");
+        let lost = OutsourcingRun { measured, ..test_run(OutsourcingSetUp::Native, &[]) };
+        let section = jitter(&[lost]);
         assert!(section.missing[0].why.contains("signal 9"));
         assert!(section.missing[0].what.contains("laser_slam"));
     }

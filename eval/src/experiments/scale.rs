@@ -3,7 +3,7 @@
 //! would need.
 
 mod counters;
-mod tell;
+mod report;
 
 use std::time::{Duration, Instant};
 
@@ -14,11 +14,25 @@ use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 use support::robot::Robot;
 
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::{RunCache, Runs};
 use crate::experiments::crowd::{self, Controller, CrowdDaemon, SHORT};
+use crate::section::About;
 use counters::{CoreUsage, TimeCounters, available_memory};
 
-pub use tell::section;
+pub use report::section;
+
+/// The experiment.
+pub const ABOUT: About = About {
+    number: 10,
+    id: "scale",
+    title: "How many robots a node serves",
+    published: "Starting a servant took over 5 s.",
+    differs: &[
+        "Each robot is a connection of one process on the same machine, pauses for 200 ms on average after each \
+         answer, and has a servant, of a node that computes for 8 ms of a core at each call and needs little memory.",
+        "Every other point was held back from the model's fit; the others determine its two parameters.",
+    ],
+};
 
 /// Mean pause in seconds between an answer and the robot's next request; pauses are exponentially distributed, so that
 /// robots do not synchronize.
@@ -43,9 +57,7 @@ struct ScalePoint {
     starts: Vec<(usize, f64)>,
     /// Response times of all requests, in seconds.
     times: Vec<f64>,
-    /// Seconds in which they were made.
     lasted: f64,
-    /// Cores that were used meanwhile.
     used: CoreUsage,
     /// Memory of the servants' cgroups, in bytes.
     servants_memory: f64,
@@ -58,7 +70,7 @@ struct ScalePoint {
 }
 
 /// Results of all points, ordered by number of robots.
-pub struct ScaleRuns(Vec<(ScalePlan, CachedResult<ScalePoint>)>);
+pub struct ScaleRuns(Vec<(ScalePlan, Runs<ScalePoint>)>);
 
 /// Connected robots, and the machine's state before they connected.
 struct ConnectedRobots {
@@ -70,21 +82,26 @@ struct ConnectedRobots {
 pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<ScaleRuns> {
     let numbers: &[usize] = if quick { &[1, 2, 4] } else { &[1, 2, 4, 8, 16, 32, 64, 100] };
     let (settles, lasts) = if quick { (0.3, 2.0) } else { (1.0, 8.0) };
-    let mut crowd = None;
-    let mut points = Vec::new();
-    for robots in numbers.iter().copied() {
-        let plan = ScalePlan { robots, settles, lasts, think: THINK, work: SHORT.milliseconds, cores: crowd::cores() };
-        let measured = cells.measure(&format!("scale {robots}"), &plan, || {
-            // Robots of the previous point stay; after a failure all of them reconnect.
-            let mut here = match crowd.take() {
-                Some(here) => here,
-                None => gather(yard)?,
-            };
-            let point = measure_point(yard.open(Controller::Off)?, &mut here, &plan)?;
-            crowd = Some(here);
-            Ok(point)
-        })?;
-        points.push((plan, measured));
+    let (think, work, cores) = (THINK, SHORT.milliseconds, crowd::cores());
+    let plan = |robots: &usize| ScalePlan { robots: *robots, settles, lasts, think, work, cores };
+    let mut points: Vec<(ScalePlan, Runs<ScalePoint>)> =
+        numbers.iter().map(|robots| (plan(robots), Runs::default())).collect();
+    for run in 0..cells.run_names("scale").len() {
+        let mut crowd = None;
+        for (plan, runs) in &mut points {
+            let plan = &*plan;
+            let name = &cells.run_names(&format!("scale {}", plan.robots))[run];
+            cells.add_run(runs, name, plan, || {
+                // Robots of the previous point stay; after a failure all of them reconnect.
+                let mut here = match crowd.take() {
+                    Some(here) => here,
+                    None => gather(yard)?,
+                };
+                let point = measure_point(yard.open(Controller::Off)?, &mut here, plan)?;
+                crowd = Some(here);
+                Ok(point)
+            })?;
+        }
     }
     Ok(ScaleRuns(points))
 }

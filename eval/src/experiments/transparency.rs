@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::application;
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::{RunCache, Runs};
 use crate::examples::{ALL, DISPARITY, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM, Origin, PEOPLE};
 use crate::place::{NetworkProfile, RobotHardware};
 use crate::robot::RequestPacing;
-use crate::section::{AGAIN, Section, Table};
+use crate::section::{About, Section, Table};
 use crate::trace::{MapGrid, Trace};
 use crate::words::{digits, or_dash};
 
@@ -24,102 +24,102 @@ const NATIVES: [usize; 2] = [3, 2];
 /// Seconds of the drive that `rosbag play` plays; and those of a quick evaluation.
 const PLAYED: [f64; 2] = [20.0, 4.0];
 
+/// The experiment.
+pub const ABOUT: About = About {
+    number: 1,
+    id: "transparency",
+    title: "Unmodified packages answer the same",
+    published: "The publication's packages and robot applications were not modified; their results are said to be the \
+        same.",
+    differs: &[
+        "Each package is asked the same requests several times on the robot, and through the stub: what the runs on \
+         the robot differ by is the package's own difference from run to run.",
+        "people_detect of opencv_apps (boxes around pedestrians in a video of opencv-doc) and stereo_image_proc \
+         (disparities of Middlebury's Aloe) are Debian's own; the others are those of examples/.",
+        "The robot's application is once the evaluation's own node, and once rosbag play and rosbag record as Debian \
+         packages them, which play the drive at its own rate; the same files run in both set-ups.",
+        "The order of messages of different topics is not kept by the stub's link, as ROS does not keep it: a node \
+         that takes whatever odometry came last answers differently from run to run; these take that of the scan's \
+         time.",
+    ],
+};
+
 /// Runs of one package: several on the robot and one through the stub.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ComparedRuns {
     natives: Vec<Trace>,
     outsourced: Trace,
     /// Files of the robot's application, with their SHA-256 before and after.
-    application: Vec<(String, String, String)>,
+    application: Vec<[String; 3]>,
 }
 
 /// Results by package and application.
-pub struct TransparencyRuns {
-    compared: Vec<(ComparedPair, CachedResult<ComparedRuns>)>,
-}
+pub struct TransparencyRuns(Vec<(ComparedPair, Runs<ComparedRuns>)>);
 
 /// A package, and the application that uses it.
 #[derive(Debug, Clone, PartialEq)]
 struct ComparedPair {
     package: String,
-    application: RobotApplication,
+    /// True if it is `rosbag play` and `rosbag record` of Debian, else it is the node of this evaluation.
+    is_rosbag: bool,
 }
 
-/// Application of the robot.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum RobotApplication {
-    /// The node of this evaluation.
-    Own,
-    /// `rosbag play` and `rosbag record` of Debian.
-    Rosbag,
-}
-
-impl RobotApplication {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Own => "the evaluation's node",
-            Self::Rosbag => "rosbag",
-        }
+impl ComparedPair {
+    fn application(&self) -> &'static str {
+        if self.is_rosbag { "rosbag" } else { "the evaluation's node" }
     }
 
-    /// Returns its files with their SHA-256.
-    fn checksums(self) -> Result<Vec<(String, String)>> {
-        match self {
-            Self::Rosbag => application::checksums(),
-            Self::Own => {
-                let program = std::fs::read("/proc/self/exe")?;
-                let sum = format!("{:x}", Sha256::digest(program));
-                Ok(vec![("eval".to_owned(), sum)])
-            }
+    fn name(&self) -> String {
+        format!("{}, asked by {}", self.package, self.application())
+    }
+
+    /// Returns the application's files with their SHA-256.
+    fn checksums(&self) -> Result<Vec<(String, String)>> {
+        if self.is_rosbag {
+            return application::checksums();
         }
+        let program = std::fs::read("/proc/self/exe")?;
+        Ok(vec![("eval".to_owned(), format!("{:x}", Sha256::digest(program)))])
     }
 }
 
 /// Measures all packages; a quick evaluation measures two, with at most `most` requests each.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -> Result<TransparencyRuns> {
-    let mut compared = Vec::new();
     // One package of each origin shows that everything works.
     let own = match most {
         Some(_) => vec![LASER_SLAM, DISPARITY],
         None => [&ALL[..], &[PEOPLE, DISPARITY]].concat(),
     };
-    let own = own.into_iter().map(|example| (example, RobotApplication::Own));
-    for (example, application) in own.chain([(LASER_SLAM, RobotApplication::Rosbag)]) {
-        let pair = ComparedPair { package: package_title(&example), application };
-        let name = format!("transparency {} {}", example.name, application.name());
+    let own = own.into_iter().map(|example| (example, false));
+    let (seconds, times) = (PLAYED[usize::from(most.is_some())], NATIVES[usize::from(most.is_some())]);
+    let mut compared = Vec::new();
+    for (example, is_rosbag) in own.chain([(LASER_SLAM, true)]) {
+        let pair = ComparedPair { package: package_title(&example), is_rosbag };
         let requests = most.unwrap_or(example.requests).min(example.requests);
-        let seconds = PLAYED[usize::from(most.is_some())];
-        let times = NATIVES[usize::from(most.is_some())];
+        let name = format!("transparency {} {}", example.name, pair.application());
         let measured = cells.measure(&name, &(requests, seconds, times), || {
             workshop.publish(&example)?;
-            let before = application.checksums()?;
+            let before = pair.checksums()?;
             let run = |at: ExecutionSite| -> Result<Trace> {
-                let robot = (FAST, NetworkProfile::Lan);
-                let ran = workshop.run(&example, at, robot, |plan| {
+                let ran = workshop.run(&example, at, (FAST, NetworkProfile::Lan), |plan| {
                     plan.most = requests;
-                    if application == RobotApplication::Rosbag {
+                    if is_rosbag {
                         plan.pace = RequestPacing::Played(seconds);
                     }
                 });
                 Ok(ran?.0)
             };
-            let natives = (0..times).map(|_| run(ExecutionSite::Native));
-            let natives = natives.collect::<Result<_>>()?;
+            let natives = (0..times).map(|_| run(ExecutionSite::Native)).collect::<Result<_>>()?;
             let outsourced = run(ExecutionSite::Outsourced)?;
-            let after = application.checksums()?.into_iter();
-            let application = before.into_iter().zip(after);
-            Ok(ComparedRuns {
-                natives,
-                outsourced,
-                application: application.map(|((file, before), (_, after))| (file, before, after)).collect(),
-            })
+            let both = before.into_iter().zip(pair.checksums()?);
+            let application = both.map(|((file, before), (_, after))| [file, before, after]).collect();
+            Ok(ComparedRuns { natives, outsourced, application })
         })?;
         compared.push((pair, measured));
     }
-    Ok(TransparencyRuns { compared })
+    Ok(TransparencyRuns(compared))
 }
 
-/// Returns a package's name in the report.
 fn package_title(example: &EvalPackage) -> String {
     match example.origin {
         Origin::Checkout => example.name.to_owned(),
@@ -130,15 +130,12 @@ fn package_title(example: &EvalPackage) -> String {
 /// Differences between runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Difference {
-    /// Requests that both runs answered.
     both: usize,
-    /// Answers among them that are equal byte by byte.
     equal: usize,
     /// Answers among them with equal boxes in any order, for answers that are lists of boxes; `None` for other answers.
     boxes: Option<usize>,
     /// Largest distance between positions, in metres.
     distance: Option<f64>,
-    /// Largest fraction of a map's cells that differ.
     map: Option<f64>,
 }
 
@@ -168,21 +165,16 @@ impl Difference {
         found
     }
 
-    /// Combines several comparisons.
     fn combine(all: impl Iterator<Item = Self>) -> Self {
         all.fold(Self::default(), |sum, one| Self {
             both: sum.both + one.both,
             equal: sum.equal + one.equal,
-            boxes: match (sum.boxes, one.boxes) {
-                (Some(sum), Some(one)) => Some(sum + one),
-                (sum, one) => sum.or(one),
-            },
+            boxes: sum.boxes.map_or(one.boxes, |sum| Some(sum + one.boxes.unwrap_or(0))),
             distance: largest(sum.distance, one.distance),
             map: largest(sum.map, one.map),
         })
     }
 
-    /// Compares all pairs of runs.
     fn compare_pairs(runs: &[Trace]) -> Self {
         let pairs = runs.iter().enumerate();
         Self::combine(pairs.flat_map(|(at, one)| runs[at + 1..].iter().map(move |other| Self::compare(one, other))))
@@ -198,10 +190,7 @@ impl Difference {
 }
 
 fn largest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
-    match (one, other) {
-        (Some(one), Some(other)) => Some(one.max(other)),
-        (one, other) => one.or(other),
-    }
+    [one, other].into_iter().flatten().reduce(f64::max)
 }
 
 /// Returns the fraction of cells that differ; 1 if the maps differ in position or size.
@@ -215,87 +204,54 @@ fn differing_cells((one, other): (&MapGrid, &MapGrid)) -> f64 {
     differ as f64 / one.cells.len() as f64
 }
 
-/// Creates the section of the report.
 pub fn section(runs: &TransparencyRuns) -> Section {
-    let mut section = Section::new(1, "transparency", "Unmodified packages answer the same");
-    section.published = "The publication's packages and robot applications were not modified; their results are said \
-        to be the same."
-        .to_owned();
-    let done = runs.compared.iter().filter_map(|(_, compared)| compared.value());
-    let times = done.map(|compared| compared.natives.len()).max().unwrap_or(0);
-    section.differs =
-        vec![
-        format!("Each package is asked the same requests {times} times on the robot, and through the stub: what the \
-            runs on the robot differ by is the package's own difference from run to run."),
-        "Two packages are Debian's own, as they are installed from there: people_detect of opencv_apps looks for \
-         pedestrians in a video of opencv-doc and answers with boxes, stereo_image_proc looks for disparities in a \
-         window that moves over a photographed plant of opencv-doc (Middlebury's Aloe). The others are those of \
-         examples/, compiled when they are pushed.".to_owned(),
-        "The robot's application is once the evaluation's own node, and once rosbag play and rosbag record as Debian \
-         packages them, which play the drive at its own rate and write the answers down; the same files run in both \
-         set-ups.".to_owned(),
-        "The order of messages of different topics is not kept by the stub's link (small ones go in turns), as ROS \
-         does not keep it: each topic has a connection of its own. A node that takes whatever odometry came last \
-         answers differently from run to run; these take that which was stamped with the scan's time.".to_owned(),
-    ];
+    let mut section = ABOUT.section();
     let mut answers = Table::new(
-        "Answers to the same requests",
+        "Answers to the same requests (published: the same, without figures)",
         "package | the robot's application | compared | answered by both | equal to the byte | \
          equal but for the order of boxes | largest distance of positions, m | cells of the map that differ, %",
     );
-    let mut files = Table::new(
-        "The robot's application, before and after its run",
-        "asked | file | SHA-256 before | SHA-256 after",
-    );
-    for (pair, measured) in &runs.compared {
-        let name = format!("{}, asked by {}", pair.package, pair.application.name());
-        let Some(compared) = measured.require(&mut section, &name, AGAIN) else {
+    let head = "asked | file | SHA-256 before | SHA-256 after";
+    let mut files = Table::new("The robot's application, before and after its run", head);
+    for (pair, measured) in &runs.0 {
+        let Some(compared) = measured.require(&mut section, &pair.name()) else {
             continue;
         };
         for trace in compared.natives.iter().chain([&compared.outsourced]) {
-            section.note_early_end(format!("{name}: a run to its end"), trace);
+            section.note_early_end(&pair.name(), trace);
         }
         let own = Difference::compare_pairs(&compared.natives);
         let natives = compared.natives.iter();
         let through = Difference::combine(natives.map(|native| Difference::compare(native, &compared.outsourced)));
-        let published = "published: the same, without figures".to_owned();
         for (name, difference) in [("native runs", own), ("native and stub", through)] {
-            let said = |value| or_dash(value, digits);
             answers.push([
                 pair.package.clone(),
-                pair.application.name().to_owned(),
+                pair.application().to_owned(),
                 name.to_owned(),
                 difference.both.to_string(),
                 difference.equal.to_string(),
                 or_dash(difference.boxes, |boxes| boxes.to_string()),
-                said(difference.distance),
-                said(difference.map.map(|share| 100.0 * share)),
+                or_dash(difference.distance, digits),
+                or_dash(difference.map.map(|share| 100.0 * share), digits),
             ]);
         }
-        answers.rows.last_mut().into_iter().for_each(|row| {
-            row[2] = format!("{} ({published})", row[2]);
-        });
         section.findings.push(finding(pair, own, through));
         let late = count_late_answers(&compared.natives[0], &compared.outsourced);
         section.findings.extend((late > 0 && through.equal < through.both).then(|| {
             format!(
-                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. A \
-                 package whose answers build on those before begins elsewhere then, and its later answers differ, too.",
+                "{}: {late} messages at the beginning were answered on the robot and not through the stub, which later \
+                 answers build on.",
                 pair.package
             )
         }));
-        for (file, before, after) in &compared.application {
-            files.push([pair.package.clone(), file.clone(), before.clone(), after.clone()]);
+        for file in &compared.application {
+            files.push([&pair.package].into_iter().chain(file));
         }
-        let changed = compared.application.iter();
-        let changed: Vec<&str> =
-            changed.filter(|(_, before, after)| before != after).map(|(file, _, _)| file.as_str()).collect();
+        let changed = compared.application.iter().filter(|[_, before, after]| before != after);
+        let changed: Vec<&str> = changed.map(|[file, ..]| file.as_str()).collect();
         section.findings.push(if changed.is_empty() {
-            format!(
-                "Not one byte of the robot's application ({}) differs between the set-ups of {}.",
-                pair.application.name(),
-                pair.package
-            )
+            let (application, package) = (pair.application(), &pair.package);
+            format!("Not one byte of the robot's application ({application}) differs between the set-ups of {package}.")
         } else {
             format!("The robot's application CHANGED while {} was compared: {}.", pair.package, changed.join(", "))
         });
@@ -315,31 +271,26 @@ fn count_late_answers(native: &Trace, outsourced: &Trace) -> usize {
 }
 
 fn finding(pair: &ComparedPair, own: Difference, through: Difference) -> String {
-    let name = format!("{}, asked by {}", pair.package, pair.application.name());
-    if through.both == 0 {
-        return format!("{name}: nothing was answered both on the robot and through the stub.");
-    }
-    if through.both == through.equal {
-        return format!(
-            "{name}: all {} answers that both gave, in comparisons with each run on the robot, are the same through \
-             the stub, to the byte.",
-            through.both
-        );
-    }
-    if through.boxes == Some(through.both) {
-        return format!(
-            "{name}: all {} answers that both gave, in comparisons with each run on the robot, hold the same boxes \
-             through the stub. {} of them are equal to the byte; the others have the boxes in another order, as some \
-             runs on the robot have ({} of {} equal to the byte): the package's threads find them in whatever order.",
-            through.both, through.equal, own.equal, own.both
-        );
-    }
-    let words = if through.is_within(own) { "within" } else { "NOT within" };
-    format!(
-        "{name}: {} of {} answers through the stub are equal to the byte, which is {words} what runs on the robot \
-         differ by ({} of {}).",
-        through.equal, through.both, own.equal, own.both
-    )
+    let Difference { both, equal, boxes, .. } = through;
+    let words = if both == 0 {
+        "nothing was answered both on the robot and through the stub".to_owned()
+    } else if both == equal {
+        format!("all {both} answers that both gave are the same through the stub, to the byte")
+    } else if boxes == Some(both) {
+        format!(
+            "all {both} answers that both gave hold the same boxes through the stub, {equal} of them in the same order \
+             (on the robot {} of {}): the package's threads find them in whatever order",
+            own.equal, own.both
+        )
+    } else {
+        let within = if through.is_within(own) { "within" } else { "NOT within" };
+        format!(
+            "{equal} of {both} answers through the stub are equal to the byte, which is {within} what runs on the \
+             robot differ by ({} of {})",
+            own.equal, own.both
+        )
+    };
+    format!("{}: {words}.", pair.name())
 }
 
 #[cfg(test)]
@@ -362,7 +313,7 @@ mod tests {
     }
 
     fn pair() -> ComparedPair {
-        ComparedPair { package: "a".to_owned(), application: RobotApplication::Rosbag }
+        ComparedPair { package: "a".to_owned(), is_rosbag: true }
     }
 
     #[test]
@@ -370,32 +321,24 @@ mod tests {
         let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
         let other = trace(&[(1, 0.0), (5, 1.5), (3, 2.0)]);
         assert_eq!(Difference::compare(&one, &other), difference(3, 2, 0.5));
-        let all = Difference::compare_pairs(&[one.clone(), other, one]);
-        assert_eq!(all, difference(9, 7, 0.5));
+        assert_eq!(Difference::compare_pairs(&[one.clone(), other, one.clone()]), difference(9, 7, 0.5));
+        // Answers are matched by their stamps.
+        let mut fewer = one.clone();
+        fewer.requests.remove(1);
+        assert_eq!(Difference::compare(&one, &fewer), difference(2, 2, 0.0));
     }
 
     #[test]
     fn boxes_in_another_order_are_counted_apart() {
-        let mut one = trace(&[(1, 0.0), (2, 0.0), (3, 0.0)]);
-        for (request, boxes) in one.requests.iter_mut().zip([7, 8, 9]) {
-            request.boxes = Some(boxes);
-        }
-        let mut other = one.clone();
-        other.requests[1].digest = Some(5);
-        other.requests[2].digest = Some(6);
-        other.requests[2].boxes = Some(10);
+        let with_boxes = |answers: [(u64, u64); 3]| {
+            let mut trace = trace(&answers.map(|(digest, _)| (digest, 0.0)));
+            trace.requests.iter_mut().zip(answers).for_each(|(request, (_, boxes))| request.boxes = Some(boxes));
+            trace
+        };
+        let (one, other) = (with_boxes([(1, 7), (2, 8), (3, 9)]), with_boxes([(1, 7), (5, 8), (6, 10)]));
         let found = Difference::compare(&one, &other);
         assert_eq!((found.both, found.equal, found.boxes), (3, 1, Some(2)));
-        let sum = Difference::combine([found, found].into_iter());
-        assert_eq!(sum.boxes, Some(4));
-    }
-
-    #[test]
-    fn answers_are_compared_by_their_stamps() {
-        let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
-        let mut other = one.clone();
-        other.requests.remove(1);
-        assert_eq!(Difference::compare(&one, &other), difference(2, 2, 0.0));
+        assert_eq!(Difference::combine([found, found].into_iter()).boxes, Some(4));
     }
 
     #[test]
@@ -404,7 +347,6 @@ mod tests {
         let mut outsourced = native.clone();
         assert_eq!(count_late_answers(&native, &outsourced), 0);
         outsourced.requests.remove(0);
-        assert_eq!(count_late_answers(&native, &outsourced), 1);
         outsourced.requests[0].digest = None;
         assert_eq!(count_late_answers(&native, &outsourced), 2);
     }
@@ -435,14 +377,13 @@ mod tests {
 
     #[test]
     fn a_changed_application_is_told() {
-        let compared = |after: &str| ComparedRuns {
-            natives: vec![trace(&[(1, 0.0)]); 2],
-            outsourced: trace(&[(1, 0.0)]),
-            application: vec![("/play".to_owned(), "12".to_owned(), after.to_owned())],
-        };
         let told = |after: &str| {
-            let compared = vec![(pair(), CachedResult::Done(compared(after)))];
-            section(&TransparencyRuns { compared }).findings[1].clone()
+            let compared = ComparedRuns {
+                natives: vec![trace(&[(1, 0.0)]); 2],
+                outsourced: trace(&[(1, 0.0)]),
+                application: vec![["/play", "12", after].map(str::to_owned)],
+            };
+            section(&TransparencyRuns(vec![(pair(), Runs::from(compared))])).findings[1].clone()
         };
         assert!(told("12").contains("Not one byte"));
         assert!(told("13").contains("CHANGED"), "{}", told("13"));

@@ -1,33 +1,38 @@
 //! Grouped bar charts.
 
-use super::Bar;
 use super::axis::{Axis, three_digits};
 use super::canvas::{
-    Anchor, HEIGHT, LegendSymbol, PlotHeader, PlotMargins, SCALE, TEXT, WIDTH, chart, colour, document, draw_line,
-    empty_plot, entries, omission_note, text_width, wrap, write_text,
+    Drawing, HEIGHT, INK, LegendSymbol, Plane, TEXT, WIDTH, colour, draw_nothing, entries, left_margin, omission_note,
+    text_width, wrap,
 };
-use anyhow::Result;
-use plotters::prelude::*;
 
 /// Fraction of a group's width that its bars fill.
 const FILLED: f64 = 0.84;
-/// Font size of the value above a bar, in shown pixels.
-const VALUE: i32 = 11;
-/// Minimum width of a bar, in shown pixels.
-const NARROW: i32 = 20;
-/// Maximum width of a bar, in shown pixels.
+/// Font size of the value above a bar.
+const VALUE: f64 = 11.0;
+/// Minimum width of a bar, which its value fits, and maximum width.
+const NARROW: f64 = 38.0;
 const WIDE: f64 = 72.0;
-const LINE: i32 = TEXT + 3;
-const WHISKER: RGBColor = RGBColor(0x22, 0x22, 0x22);
 
-/// Bars of one group, each with the index of its name.
-struct BarGroup<'a> {
-    name: &'a str,
-    bars: Vec<(usize, &'a Bar)>,
+/// A bar of a bar chart.
+#[derive(Debug, Clone)]
+pub struct Bar {
+    /// Group of adjacent bars; groups are ordered by first occurrence.
+    pub group: String,
+    /// Name in the legend; each name has one colour.
+    pub name: String,
+    pub value: f64,
+    pub spread: Option<(f64, f64)>,
+}
+
+impl Bar {
+    pub fn new(group: impl Into<String>, name: impl Into<String>, value: f64) -> Self {
+        Self { group: group.into(), name: name.into(), value, spread: None }
+    }
 }
 
 /// Draws grouped bars with whiskers and values. `name` is the label of the axis, with its unit.
-pub fn bars(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<String> {
+pub fn bars(title: &str, name: &str, bars: &[Bar], log: bool) -> String {
     // A zero has no height on a logarithmic axis, but its value is known and written.
     let known: Vec<&Bar> = bars.iter().filter(|bar| Axis::for_values([bar.value], false).is_some()).collect();
     let omitted = bars.len() - known.len();
@@ -37,96 +42,73 @@ pub fn bars(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<String> 
         [bar.value, spread.0, spread.1]
     });
     let Some(y) = Axis::for_values(ends, log) else {
-        return empty_plot(title, omitted);
+        return draw_nothing(title, omitted);
     };
-    let (names, groups) = group_bars(&known);
-    let most = groups.iter().map(|group| group.bars.len()).max();
-    let most = most.unwrap_or(1) as f64;
-
-    let longest = groups.iter().flat_map(|group| group.name.split_whitespace()).map(|word| word.chars().count()).max();
-    let least = text_width(longest.unwrap_or(0), TEXT) + 10;
-    let least = least.max((f64::from(NARROW) * most / FILLED) as i32) as u32;
-    let left = PlotMargins::for_axis(&y).left;
-    let width = WIDTH.max(least * groups.len() as u32 + left + 24);
-    let group_width = f64::from(width - left - 24) / groups.len() as f64;
+    let names = find_distinct(known.iter().map(|bar| bar.name.as_str()));
+    let groups = find_distinct(known.iter().map(|bar| bar.group.as_str()));
+    let bars_of = |group: &str| known.iter().filter(|bar| bar.group == group).copied().collect::<Vec<&Bar>>();
+    let most = groups.iter().map(|group| bars_of(group).len()).max().unwrap_or(1) as f64;
+    let words = groups.iter().flat_map(|group| group.split_whitespace()).map(|word| word.chars().count());
+    let least = (text_width(words.max().unwrap_or(0), TEXT) + 10.0).max(NARROW * most / FILLED);
+    let left = left_margin(&y);
+    let width = WIDTH.max(least * groups.len() as f64 + left + 24.0);
+    let group_width = (width - left - 24.0) / groups.len() as f64;
     let bar_width = (group_width * FILLED / most).min(WIDE);
 
-    let values = known.iter().map(|bar| three_digits(bar.value).chars().count());
-    let longest = text_width(values.max().unwrap_or(0), VALUE);
-    let upwards = f64::from(longest) > bar_width * 1.12;
-    let above = if upwards { longest + 8 } else { VALUE + 8 };
-    let room = f64::from(above) / f64::from(HEIGHT - 110);
-    let y = y.with_zero().with_room(room);
-
-    let letters = (group_width - 8.0) / text_width(10, TEXT) as f64 * 10.0;
-    let labels: Vec<Vec<String>> = groups.iter().map(|group| wrap(group.name, letters as usize)).collect();
-    let lines = labels.iter().map(Vec::len).max().unwrap_or(0) as u32;
-    let below = 12 + LINE as u32 * lines;
-
-    let head = PlotHeader::new(title, entries(names, LegendSymbol::Patch), width);
-    document(&head, (width, HEIGHT - 48 + below), omission_note(omitted), |area| {
-        let rows = (head.height, head.height + HEIGHT - 48);
-        let mut x = Axis::with_bounds(0.0, groups.len() as f64);
-        x.marks.clear();
-        let sides = PlotMargins { left, right: 24, below: false };
-        let chart = chart(area, rows, &sides, (&x, ""), (&y, name))?;
-        let at = |x: f64, y: f64| chart.backend_coord(&(x, y));
-        let bottom = if log { y.low } else { 0.0f64.clamp(y.low, y.high) };
-        let half = bar_width / group_width / 2.0;
-        for (index, group) in groups.iter().enumerate() {
-            let middle = index as f64 + 0.5;
-            for (place, (of_name, bar)) in group.bars.iter().enumerate() {
-                let x = middle + (2.0 * place as f64 + 1.0 - group.bars.len() as f64) * half;
-                let height = y.position(bar.value).unwrap_or(bottom);
-                let (from, to) = (at(x - half * 0.92, height), at(x + half * 0.92, bottom));
-                area.draw(&Rectangle::new([from, to], colour(*of_name).filled()))?;
-                let (centre, mut top) = (at(x, height).0, from.1.min(to.1));
-                if let Some((low, high)) = bar.spread {
-                    let ends = (y.position(low), y.position(high));
-                    // On a logarithmic axis a whisker down to zero starts at the bottom.
-                    let low_end = ends.0.or((log && low <= 0.0).then_some(y.low));
-                    if let (Some(low), Some(high)) = (low_end, ends.1) {
-                        let (low, high) = (at(x, low).1, at(x, high).1);
-                        let wide = (bar_width * 0.18) as i32 * SCALE;
-                        draw_line(area, &[(centre, low), (centre, high)], WHISKER, 1)?;
-                        for end in [low, high] {
-                            let cap = [(centre - wide, end), (centre + wide, end)];
-                            draw_line(area, &cap, WHISKER, 1)?;
-                        }
-                        top = top.min(high);
-                    }
-                }
-                let (anchor, gap) = if upwards { (Anchor::Upwards, 4) } else { (Anchor::Above, 1) };
-                let place = (centre, top - gap * SCALE);
-                write_text(area, &three_digits(bar.value), place, VALUE, anchor)?;
-            }
+    let mut drawing = Drawing::new(title, &entries(names.iter().copied(), LegendSymbol::Patch), width);
+    let mut x = Axis::with_bounds(0.0, groups.len() as f64);
+    x.marks.clear();
+    let (top, bottom) = (drawing.top, drawing.top + HEIGHT);
+    let y = y.with_zero().with_room((VALUE + 8.0) / HEIGHT);
+    let plane = Plane { x, y, left, right: width - 24.0, top, bottom };
+    drawing.axes(&plane, Some(""), name);
+    let mut lowest = bottom;
+    for (index, group) in groups.iter().enumerate() {
+        let (centre, _) = plane.pixel(index as f64 + 0.5, plane.y.low);
+        let bars = bars_of(group);
+        for (place, bar) in bars.iter().enumerate() {
+            let x = centre + (place as f64 + 0.5 - bars.len() as f64 / 2.0) * bar_width;
+            let of_name = names.iter().position(|name| *name == bar.name).unwrap_or(0);
+            draw_bar(&mut drawing, &plane, bar, (x, bar_width), (log, colour(of_name)));
         }
-        let (_, base) = at(0.0, y.low);
-        for (index, lines) in labels.iter().enumerate() {
-            let centre = at(index as f64 + 0.5, y.low).0;
-            for (line, text) in lines.iter().enumerate() {
-                let below = base + (8 + LINE * line as i32) * SCALE;
-                write_text(area, text, (centre, below), TEXT, Anchor::Below)?;
-            }
-        }
-        Ok(())
-    })
-}
-
-/// Returns names and groups in the order of first occurrence.
-fn group_bars<'a>(bars: &[&'a Bar]) -> (Vec<&'a str>, Vec<BarGroup<'a>>) {
-    let mut names: Vec<&str> = Vec::new();
-    let mut groups: Vec<BarGroup> = Vec::new();
-    for bar in bars {
-        let known = names.iter().position(|name| *name == bar.name);
-        let index = known.unwrap_or_else(|| {
-            names.push(&bar.name);
-            names.len() - 1
-        });
-        match groups.iter_mut().find(|group| group.name == bar.group) {
-            Some(group) => group.bars.push((index, bar)),
-            None => groups.push(BarGroup { name: &bar.group, bars: vec![(index, bar)] }),
+        for (line, text) in wrap(group, (group_width / text_width(1, TEXT)) as usize).iter().enumerate() {
+            let below = bottom + 20.0 + (TEXT + 3.0) * line as f64;
+            drawing.text((centre, below), "middle", TEXT, text);
+            lowest = lowest.max(below);
         }
     }
-    (names, groups)
+    drawing.finish(lowest, omission_note(omitted).as_deref())
+}
+
+/// Draws a bar around `x` with its whisker and its value.
+fn draw_bar(drawing: &mut Drawing, plane: &Plane, bar: &Bar, (x, width): (f64, f64), (log, colour): (bool, &str)) {
+    let pixel = |position: f64| plane.pixel(plane.x.low, position).1;
+    let base = if log { plane.y.low } else { 0.0f64.clamp(plane.y.low, plane.y.high) };
+    let height = pixel(plane.y.position(bar.value).unwrap_or(base));
+    drawing.rectangle((x - width * 0.46, height), (x + width * 0.46, pixel(base)), colour);
+    let mut top = height.min(pixel(base));
+    if let Some((low, high)) = bar.spread {
+        // On a logarithmic axis a whisker down to zero starts at the bottom.
+        let low = plane.y.position(low).or((log && low <= 0.0).then_some(plane.y.low));
+        if let Some((low, high)) = low.zip(plane.y.position(high)) {
+            let (low, high) = (pixel(low), pixel(high));
+            drawing.line(&[(x, low), (x, high)], INK, 1.0);
+            for end in [low, high] {
+                drawing.line(&[(x - width * 0.18, end), (x + width * 0.18, end)], INK, 1.0);
+            }
+            top = top.min(high);
+        }
+    }
+    drawing.text((x, top - 3.0), "middle", VALUE, &three_digits(bar.value));
+}
+
+/// Returns each text once, in the order of first occurrence.
+fn find_distinct<'a>(texts: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    let mut found: Vec<&str> = Vec::new();
+    for text in texts {
+        if !found.contains(&text) {
+            found.push(text);
+        }
+    }
+    found
 }

@@ -1,57 +1,46 @@
-//! Common parts of all plots: background, title, legend, axes and markers.
-//!
-//! Everything is drawn at [`SCALE`] times its size, because plotters rounds to whole pixels.
+//! A drawing as SVG: title and legend first, then axes and shapes below them.
+
+use std::fmt::Write;
 
 use super::axis::Axis;
-use anyhow::Result;
-use plotters::coord::Shift;
-use plotters::prelude::*;
-use plotters::style::text_anchor::{HPos, Pos, VPos};
+use crate::page::escape;
 
-/// Drawn pixels per shown pixel.
-pub(super) const SCALE: i32 = 2;
-/// Width in shown pixels.
-pub(super) const WIDTH: u32 = 860;
-/// Height in shown pixels below title and legend.
-pub(super) const HEIGHT: u32 = 380;
-const TITLE: i32 = 15;
-/// Default font size in shown pixels.
-pub(super) const TEXT: i32 = 12;
-const SMALL: i32 = 11;
-const GREY: RGBColor = RGBColor(0x55, 0x55, 0x55);
-const GRID: RGBColor = RGBColor(0xdd, 0xdd, 0xdd);
-const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
-const LEGEND_ROW: i32 = 20;
-const LEGEND_LEFT: i32 = 16;
-/// Height of the note below the plot.
-const NOTE: u32 = 14;
-/// Space to the left of the vertical axis' name.
-const EDGE: u32 = 8;
-/// Space below the axis for its labels and name.
-const BELOW: i32 = 48;
+/// Width of a drawing, and height of the area between the axes, in pixels.
+pub(super) const WIDTH: f64 = 860.0;
+pub(super) const HEIGHT: f64 = 320.0;
+/// Space below an area for the labels and the name of its horizontal axis.
+pub(super) const BELOW: f64 = 52.0;
+/// Default font size.
+pub(super) const TEXT: f64 = 12.0;
+pub(super) const INK: &str = "#222";
+pub(super) const SHADE: &str = "#ececec";
+const TITLE: f64 = 15.0;
+const GREY: &str = "#555";
+const LEGEND_ROW: f64 = 20.0;
 
 /// Palette of Okabe and Ito; yellow comes last because it is hard to see on white.
-const PALETTE: [RGBColor; 8] = [
-    RGBColor(0x00, 0x72, 0xb2),
-    RGBColor(0xd5, 0x5e, 0x00),
-    RGBColor(0x00, 0x9e, 0x73),
-    RGBColor(0xcc, 0x79, 0xa7),
-    RGBColor(0xe6, 0x9f, 0x00),
-    RGBColor(0x56, 0xb4, 0xe9),
-    RGBColor(0x00, 0x00, 0x00),
-    RGBColor(0xf0, 0xe4, 0x42),
+const PALETTE: [&str; 8] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#f0e442"];
+/// Outlines of the markers, one unit in radius: circle, triangles, square, diamond, crosses, ring.
+const MARKERS: [&str; 8] = [
+    "M-.9 0a.9 .9 0 1 0 1.8 0a.9 .9 0 1 0-1.8 0z",
+    "M0-1L1 .8H-1z",
+    "M-.8-.8H.8V.8H-.8z",
+    "M0-1.2L1 0L0 1.2L-1 0z",
+    "M-.8-1L0-.2L.8-1L1-.8L.2 0L1 .8L.8 1L0 .2L-.8 1L-1 .8L-.2 0L-1-.8z",
+    "M0 1L1-.8H-1z",
+    "M-.2-1H.2V-.2H1V.2H.2V1H-.2V.2H-1V-.2H-.2z",
+    "M-.9 0a.9 .9 0 1 0 1.8 0a.9 .9 0 1 0-1.8 0zM-.5 0a.5 .5 0 1 0 1 0a.5 .5 0 1 0-1 0z",
 ];
 
-pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-pub(super) type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<Axis, Axis>>;
+/// A point of the drawing, in pixels from its upper left corner.
+pub(super) type Pixel = (f64, f64);
 
 /// Symbol of a series in the legend.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq)]
 pub(super) enum LegendSymbol {
     Line,
     Point,
     Patch,
-    /// A shaded range.
     Shade,
 }
 
@@ -62,58 +51,18 @@ pub(super) struct LegendEntry<'a> {
     pub sign: LegendSymbol,
 }
 
-/// Returns legend entries for series in their order.
+/// Returns legend entries for series in their order; a series without a name has none.
 pub(super) fn entries<'a>(names: impl IntoIterator<Item = &'a str>, sign: LegendSymbol) -> Vec<LegendEntry<'a>> {
-    let numbered = names.into_iter().enumerate();
+    let numbered = names.into_iter().enumerate().filter(|(_, name)| !name.is_empty());
     numbered.map(|(index, name)| LegendEntry { index, name, sign }).collect()
 }
 
-pub(super) fn colour(index: usize) -> RGBColor {
+pub(super) fn colour(index: usize) -> &'static str {
     PALETTE[index % PALETTE.len()]
 }
 
-/// Colour of shaded ranges.
-pub(super) fn shade() -> RGBColor {
-    RGBColor(0xec, 0xec, 0xec)
-}
-
-/// Estimates the width of a text in shown pixels.
-pub(super) fn text_width(letters: usize, size: i32) -> i32 {
-    (letters as f64 * f64::from(size) * 0.58).ceil() as i32
-}
-
-/// plotters divides font sizes by 1.24.
-fn font(size: i32) -> FontDesc<'static> {
-    ("sans-serif", f64::from(size * SCALE) * 1.24).into_font()
-}
-
-/// Placement of a text relative to its point.
-#[derive(Clone, Copy)]
-pub(super) enum Anchor {
-    /// To the right of the point.
-    Left,
-    /// Centred above the point.
-    Above,
-    /// Centred below the point.
-    Below,
-    /// Above the point, reading upwards.
-    Upwards,
-}
-
-/// Writes a text at a drawn pixel.
-pub(super) fn write_text(area: &Area, text: &str, at: (i32, i32), size: i32, anchor: Anchor) -> Result<()> {
-    let (h, v) = match anchor {
-        Anchor::Left | Anchor::Upwards => (HPos::Left, VPos::Center),
-        Anchor::Above => (HPos::Center, VPos::Bottom),
-        Anchor::Below => (HPos::Center, VPos::Top),
-    };
-    let mut font = font(size);
-    if let Anchor::Upwards = anchor {
-        font = font.transform(FontTransform::Rotate270);
-    }
-    let style = TextStyle::from(font).color(&INK).pos(Pos::new(h, v));
-    area.draw(&Text::new(text.to_owned(), at, style))?;
-    Ok(())
+pub(super) fn text_width(letters: usize, size: f64) -> f64 {
+    letters as f64 * size * 0.58
 }
 
 /// Breaks a text into lines of at most `letters` characters; a longer word gets a line of its own.
@@ -131,214 +80,172 @@ pub(super) fn wrap(text: &str, letters: usize) -> Vec<String> {
     lines
 }
 
-/// Title and legend of a document, measured before they are drawn.
-pub(super) struct PlotHeader<'a> {
-    title: Vec<String>,
-    /// Rows of the legend; each entry with its distance from the left in shown pixels.
-    legend: Vec<Vec<(i32, LegendEntry<'a>)>>,
-    /// Shown pixels from the top of the document to the plot.
-    pub height: u32,
+/// The area of a plot between its axes.
+pub(super) struct Plane {
+    pub x: Axis,
+    pub y: Axis,
+    pub left: f64,
+    pub right: f64,
+    pub top: f64,
+    pub bottom: f64,
 }
 
-impl<'a> PlotHeader<'a> {
-    pub fn new(title: &str, legend: Vec<LegendEntry<'a>>, width: u32) -> Self {
-        let title = wrap(title, (f64::from(width) / (f64::from(TITLE) * 0.6)) as usize);
-        let mut rows: Vec<Vec<(i32, LegendEntry)>> = Vec::new();
-        let mut next = LEGEND_LEFT;
+impl Plane {
+    pub fn pixel(&self, x: f64, y: f64) -> Pixel {
+        let across = self.left + (self.right - self.left) * self.x.share(x);
+        (across, self.bottom - (self.bottom - self.top) * self.y.share(y))
+    }
+
+    /// Returns the pixel of a point; `None` if an axis cannot show it.
+    pub fn place(&self, (x, y): (f64, f64)) -> Option<Pixel> {
+        Some(self.pixel(self.x.position(x)?, self.y.position(y)?))
+    }
+}
+
+/// Space to the left of an area for the labels and the name of its vertical axis.
+pub(super) fn left_margin(y: &Axis) -> f64 {
+    text_width(y.longest_label(), TEXT) + 44.0
+}
+
+/// A document being drawn.
+pub(super) struct Drawing {
+    body: String,
+    width: f64,
+    pub top: f64,
+}
+
+impl Drawing {
+    pub fn new(title: &str, legend: &[LegendEntry], width: f64) -> Self {
+        let mut drawing = Self { body: String::new(), width, top: 8.0 };
+        for line in wrap(title, (width / (TITLE * 0.6)) as usize) {
+            drawing.top += TITLE + 6.0;
+            let at = drawing.top - 4.0;
+            drawing.push(format_args!(
+                "<text x=\"14\" y=\"{at}\" font-size=\"{TITLE}\" font-weight=\"bold\">{}</text>",
+                escape(&line)
+            ));
+        }
+        let mut x = f64::INFINITY;
         for entry in legend {
-            let wide = text_width(entry.name.chars().count(), TEXT) + 46;
-            match rows.last_mut() {
-                Some(row) if next + wide <= width as i32 => row.push((next, entry)),
-                _ => {
-                    next = LEGEND_LEFT;
-                    rows.push(vec![(next, entry)]);
-                }
+            let wide = text_width(entry.name.chars().count(), TEXT) + 46.0;
+            if x + wide > width {
+                (x, drawing.top) = (16.0, drawing.top + LEGEND_ROW);
             }
-            next += wide;
+            let y = drawing.top - 6.0;
+            drawing.draw_symbol((x, y), entry);
+            drawing.text((x + 28.0, y + 4.0), "start", TEXT, entry.name);
+            x += wide;
         }
-        let height = 14 + (TITLE + 6) * title.len() as i32 + LEGEND_ROW * rows.len() as i32;
-        Self { title, legend: rows, height: height as u32 }
+        drawing.top += 10.0;
+        drawing
     }
 
-    fn draw(&self, area: &Area) -> Result<()> {
-        let mut y = 8;
-        for line in &self.title {
-            let style = TextStyle::from(font(TITLE).style(FontStyle::Bold)).color(&INK);
-            area.draw(&Text::new(line.clone(), (14 * SCALE, y * SCALE), style))?;
-            y += TITLE + 6;
+    fn push(&mut self, element: std::fmt::Arguments) {
+        // Writing to a String cannot fail.
+        let _ = writeln!(self.body, "{element}");
+    }
+
+    /// Writes a text; `anchor` is SVG's text-anchor.
+    pub fn text(&mut self, (x, y): Pixel, anchor: &str, size: f64, words: &str) {
+        let words = escape(words);
+        self.push(format_args!(
+            "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" font-size=\"{size}\">{words}</text>"
+        ));
+    }
+
+    pub fn line(&mut self, path: &[Pixel], colour: &str, width: f64) {
+        if path.len() > 1 {
+            let points: Vec<String> = path.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
+            self.push(format_args!(
+                "<polyline points=\"{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width}\"/>",
+                points.join(" ")
+            ));
         }
-        y += LEGEND_ROW / 2;
-        for row in &self.legend {
-            for (x, entry) in row {
-                draw_symbol(area, (*x * SCALE, y * SCALE), entry)?;
-                let beside = ((*x + 28) * SCALE, y * SCALE);
-                write_text(area, entry.name, beside, TEXT, Anchor::Left)?;
+    }
+
+    pub fn rectangle(&mut self, one: Pixel, other: Pixel, colour: &str) {
+        let (x, y) = (one.0.min(other.0), one.1.min(other.1));
+        let (width, height) = ((one.0 - other.0).abs(), (one.1 - other.1).abs());
+        self.push(format_args!(
+            "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height:.1}\" fill=\"{colour}\"/>"
+        ));
+    }
+
+    /// Draws the marker of a series; when colours repeat, the markers differ.
+    pub fn marker(&mut self, (x, y): Pixel, index: usize, radius: f64) {
+        let shape = MARKERS[(index + index / PALETTE.len()) % MARKERS.len()];
+        self.push(format_args!(
+            "<path transform=\"translate({x:.1},{y:.1}) scale({radius})\" d=\"{shape}\" fill-rule=\"evenodd\" \
+             fill=\"{}\"/>",
+            colour(index)
+        ));
+    }
+
+    fn draw_symbol(&mut self, (x, y): Pixel, entry: &LegendEntry) {
+        match entry.sign {
+            LegendSymbol::Line => self.line(&[(x, y), (x + 22.0, y)], colour(entry.index), 2.0),
+            LegendSymbol::Patch => self.rectangle((x + 4.0, y - 6.0), (x + 20.0, y + 6.0), colour(entry.index)),
+            LegendSymbol::Shade => self.rectangle((x + 4.0, y - 6.0), (x + 20.0, y + 6.0), SHADE),
+            LegendSymbol::Point => {}
+        }
+        if matches!(entry.sign, LegendSymbol::Line | LegendSymbol::Point) {
+            self.marker((x + 11.0, y), entry.index, 4.0);
+        }
+    }
+
+    /// Draws grid, axes and labels; without a name the horizontal axis has no labels.
+    pub fn axes(&mut self, plane: &Plane, x_name: Option<&str>, y_name: &str) {
+        let Plane { left, right, top, bottom, .. } = *plane;
+        for mark in &plane.y.marks {
+            let (_, y) = plane.pixel(plane.x.low, *mark);
+            self.line(&[(left, y), (right, y)], "#ddd", 1.0);
+            self.text((left - 6.0, y + 4.0), "end", TEXT - 1.0, &plane.y.label(*mark));
+        }
+        for mark in &plane.x.marks {
+            let (x, _) = plane.pixel(*mark, plane.y.low);
+            self.line(&[(x, top), (x, bottom)], "#ddd", 1.0);
+            if x_name.is_some() {
+                self.text((x, bottom + 16.0), "middle", TEXT - 1.0, &plane.x.label(*mark));
             }
-            y += LEGEND_ROW;
         }
-        Ok(())
+        self.line(&[(left, top), (left, bottom), (right, bottom)], GREY, 1.0);
+        if let Some(name) = x_name {
+            self.text(((left + right) / 2.0, bottom + 38.0), "middle", TEXT, name);
+        }
+        let (middle, name) = ((top + bottom) / 2.0, escape(y_name));
+        self.push(format_args!(
+            "<text transform=\"translate(18,{middle:.1}) rotate(-90)\" text-anchor=\"middle\" \
+             font-size=\"{TEXT}\">{name}</text>"
+        ));
     }
-}
 
-fn draw_symbol(area: &Area, (x, y): (i32, i32), entry: &LegendEntry) -> Result<()> {
-    let (middle, end) = (x + 11 * SCALE, x + 22 * SCALE);
-    match entry.sign {
-        LegendSymbol::Line => {
-            draw_line(area, &[(x, y), (end, y)], colour(entry.index), 2)?;
-            draw_marker(area, (middle, y), entry.index, 4)?;
-        }
-        LegendSymbol::Point => draw_marker(area, (middle, y), entry.index, 4)?,
-        LegendSymbol::Patch | LegendSymbol::Shade => {
-            let colour = match entry.sign {
-                LegendSymbol::Shade => shade(),
-                _ => colour(entry.index),
-            };
-            let half = 6 * SCALE;
-            let corners = [(x + 4 * SCALE, y - half), (end - 2 * SCALE, y + half)];
-            area.draw(&Rectangle::new(corners, colour.filled()))?;
-        }
-    }
-    Ok(())
-}
-
-/// Creates a document with title and legend, the drawing of `draw` below them, and a note in the bottom corner. The
-/// size is that of the part below the legend, in shown pixels; `draw` gets the whole document.
-pub(super) fn document(
-    head: &PlotHeader,
-    (width, height): (u32, u32),
-    note: Option<String>,
-    draw: impl FnOnce(&Area) -> Result<()>,
-) -> Result<String> {
-    let scale = SCALE as u32;
-    let height = height + head.height + if note.is_some() { NOTE } else { 0 };
-    let mut text = String::new();
-    {
-        let backend = SVGBackend::with_string(&mut text, (width * scale, height * scale));
-        let area = backend.into_drawing_area();
-        area.fill(&WHITE)?;
-        head.draw(&area)?;
-        draw(&area)?;
+    /// Ends the document below `bottom`, with a note in the corner.
+    pub fn finish(mut self, bottom: f64, note: Option<&str>) -> String {
+        let height = bottom + if note.is_some() { 26.0 } else { 12.0 };
         if let Some(note) = note {
-            let style = TextStyle::from(font(SMALL - 1)).color(&GREY).pos(Pos::new(HPos::Right, VPos::Bottom));
-            let at = ((width as i32 - 8) * SCALE, (height as i32 - 4) * SCALE);
-            area.draw(&Text::new(note, at, style))?;
+            self.text((self.width - 8.0, height - 6.0), "end", TEXT - 2.0, note);
         }
-        area.present()?;
+        format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width:.0}\" height=\"{height:.0}\" viewBox=\"0 0 \
+             {width:.0} {height:.0}\" font-family=\"sans-serif\" fill=\"{INK}\">\n<rect width=\"100%\" \
+             height=\"100%\" fill=\"white\"/>\n{}</svg>\n",
+            self.body,
+            width = self.width
+        )
     }
-    Ok(text.replacen(
-        &format!("width=\"{}\" height=\"{}\"", width * scale, height * scale),
-        &format!("width=\"{width}\" height=\"{height}\""),
-        1,
-    ))
 }
 
-/// Returns the note on omitted values.
 pub(super) fn omission_note(count: usize) -> Option<String> {
-    match count {
-        0 => None,
-        1 => Some("1 value is left out: not finite, or no place on the axis".to_owned()),
-        more => Some(format!("{more} values are left out: not finite, or no place on the axis")),
-    }
+    let are = if count == 1 { "value is" } else { "values are" };
+    (count > 0).then(|| format!("{count} {are} left out: not finite, or no place on the axis"))
 }
 
 /// Creates a document that says that nothing was measured.
-pub(super) fn empty_plot(title: &str, omitted: usize) -> Result<String> {
-    let head = PlotHeader::new(title, Vec::new(), WIDTH);
-    document(&head, (WIDTH, 90), omission_note(omitted), |area| {
-        let (width, height) = area.dim_in_pixel();
-        let at = (width as i32 / 2, height as i32 / 2 + 10 * SCALE);
-        write_text(area, "nothing was measured", at, TITLE, Anchor::Above)
-    })
-}
-
-/// Margins of a plot, in shown pixels.
-pub(super) struct PlotMargins {
-    pub left: u32,
-    pub right: u32,
-    /// True if the labels of the horizontal axis are drawn here.
-    pub below: bool,
-}
-
-impl PlotMargins {
-    /// Leaves room for the labels and the name of the vertical axis.
-    pub fn for_axis(y: &Axis) -> Self {
-        Self { left: (text_width(y.longest_label(), TEXT) + 36) as u32 + EDGE, right: 24, below: true }
-    }
-}
-
-/// Draws axes and grid between two rows of an area (in shown pixels from the top of the document).
-pub(super) fn chart<'a, 'b>(
-    area: &'a Area<'b>,
-    (top, bottom): (u32, u32),
-    sides: &PlotMargins,
-    (x, x_name): (&Axis, &str),
-    (y, y_name): (&Axis, &str),
-) -> Result<Chart<'a, 'b>> {
-    let scale = SCALE as u32;
-    let (_, height) = area.dim_in_pixel();
-    let below = if sides.below { BELOW as u32 } else { 8 };
-    let mut chart = ChartBuilder::on(area)
-        .margin_top(top * scale)
-        .margin_bottom(height - bottom * scale)
-        .margin_left(EDGE * scale)
-        .margin_right(sides.right * scale)
-        .x_label_area_size(below * scale)
-        .y_label_area_size((sides.left - EDGE) * scale)
-        .build_cartesian_2d(x.clone(), y.clone())?;
-    let unwritten = |_: &f64| String::new();
-    let labels = TextStyle::from(font(SMALL)).color(&INK);
-    let mut mesh = chart.configure_mesh();
-    mesh.bold_line_style(GRID.stroke_width(SCALE as u32))
-        .light_line_style(TRANSPARENT)
-        .axis_style(GREY.stroke_width(SCALE as u32))
-        .label_style(labels)
-        .axis_desc_style(TextStyle::from(font(TEXT)).color(&INK))
-        .set_all_tick_mark_size(4 * SCALE)
-        .y_desc(y_name);
-    if sides.below {
-        mesh.x_desc(x_name);
-    } else {
-        mesh.x_label_formatter(&unwritten);
-    }
-    mesh.draw()?;
-    Ok(chart)
-}
-
-/// Draws a line through drawn pixels; `width` is in shown pixels.
-pub(super) fn draw_line(area: &Area, path: &[(i32, i32)], colour: RGBColor, width: u32) -> Result<()> {
-    if path.len() > 1 {
-        let style = colour.stroke_width(width * SCALE as u32);
-        area.draw(&PathElement::new(path.to_vec(), style))?;
-    }
-    Ok(())
-}
-
-/// Draws the marker of a series at a drawn pixel; `size` is its radius in shown pixels.
-pub(super) fn draw_marker(area: &Area, (x, y): (i32, i32), index: usize, size: i32) -> Result<()> {
-    let colour = colour(index);
-    let r = size * SCALE;
-    let polygon = |points: &[(i32, i32)]| {
-        let points: Vec<_> = points.iter().map(|(dx, dy)| (x + dx, y + dy)).collect();
-        area.draw(&Polygon::new(points, colour.filled()))
-    };
-    let cross = |a: (i32, i32), b: (i32, i32)| {
-        let style = colour.stroke_width(2 * SCALE as u32);
-        area.draw(&PathElement::new(vec![(x - a.0, y - a.1), (x + a.0, y + a.1)], style))?;
-        area.draw(&PathElement::new(vec![(x - b.0, y - b.1), (x + b.0, y + b.1)], style))
-    };
-    let s = r * 4 / 5;
-    // When colours repeat, the markers differ.
-    match (index + index / PALETTE.len()) % 8 {
-        0 => area.draw(&Circle::new((x, y), r * 9 / 10, colour.filled()))?,
-        1 => polygon(&[(0, -r), (r, s), (-r, s)])?,
-        2 => polygon(&[(-s, -s), (s, -s), (s, s), (-s, s)])?,
-        3 => polygon(&[(0, -r - SCALE), (r, 0), (0, r + SCALE), (-r, 0)])?,
-        4 => cross((s, s), (s, -s))?,
-        5 => polygon(&[(0, r), (r, -s), (-r, -s)])?,
-        6 => cross((r, 0), (0, r))?,
-        _ => area.draw(&Circle::new((x, y), s, colour.stroke_width(2 * SCALE as u32)))?,
-    }
-    Ok(())
+pub(super) fn draw_nothing(title: &str, omitted: usize) -> String {
+    let mut drawing = Drawing::new(title, &[], WIDTH);
+    let bottom = drawing.top + 60.0;
+    drawing.text((WIDTH / 2.0, bottom - 20.0), "middle", TITLE, "nothing was measured");
+    drawing.finish(bottom, omission_note(omitted).as_deref())
 }
 
 #[cfg(test)]

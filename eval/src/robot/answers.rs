@@ -7,7 +7,7 @@ use ros::bus::SerializedMessage;
 use tokio::time::Instant as At;
 
 use super::boxes;
-use super::numbers::FIRST;
+use super::plan::FIRST;
 use crate::recording::{read_floats, read_header, read_pose};
 use crate::trace::{MapGrid, RequestSample};
 

@@ -5,14 +5,16 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use ros::bus::MatchedPeers;
+use support::procfs;
 use support::site::{NodeProcess, Site};
 use tokio::sync::watch::Receiver;
 use tokio::time::{Instant as At, timeout};
 
 use super::answers::fill_answer;
+use super::carried;
 use super::ends::RobotEndpoints;
-use super::numbers::{FIRST, WARM_UP};
-use super::{RequestPacing, RobotPlan, carried};
+use super::plan::{FIRST, RequestPacing, RobotPlan, WARM_UP};
+use crate::place::request_network;
 use crate::recording::RecordedStep;
 use crate::trace::{RequestSample, Trace};
 
@@ -26,8 +28,9 @@ const OTHERS: Duration = Duration::from_secs(5);
 pub(super) const LOOK: Duration = Duration::from_millis(500);
 /// Time for messages of other topics after the last answer.
 const BESIDES: Duration = Duration::from_millis(300);
-/// Time for late answers after the last request that is played at its recorded time.
-const STRAGGLERS: Duration = Duration::from_secs(10);
+/// Number of consecutive answers in time after which requests at a rate are counted, and maximum time for that.
+const AWAKE: usize = 6;
+const PATIENCE: Duration = Duration::from_secs(30);
 
 pub(super) fn ask(
     site: &Site,
@@ -65,13 +68,22 @@ pub(super) fn ask(
         let chosen: Vec<&RecordedStep> = chosen.collect();
         let mut trace = match plan.pace {
             RequestPacing::OneByOne => ends.ask_one_by_one(plan, &chosen, node).await?,
-            RequestPacing::Recorded(speed) => ends.ask_as_recorded(speed, &chosen, node).await?,
+            RequestPacing::Recorded(speed) => {
+                let first = chosen.first().map_or(0.0, |step| step.at);
+                let due: Vec<_> = chosen.iter().map(|step| ((step.at - first) / speed, *step)).collect();
+                // The last answer ends the wait: earlier ones will not arrive any more.
+                ends.ask_when_due(plan, &due, |all| all.last().is_none_or(|last| last.response.is_some())).await?
+            }
             RequestPacing::Played(_) => bail!("rosbag plays by itself"),
             RequestPacing::Rate { hertz, in_time } => {
                 let cycle: Vec<&RecordedStep> = measured.iter().cycle().take(plan.most).collect();
-                ends.ask_at_rate(plan, (hertz, in_time), &cycle, node).await?
+                let late_before = !ends.warm_up(&cycle, hertz, in_time).await?;
+                let due: Vec<_> = (0..).zip(cycle).map(|(index, step)| (f64::from(index) / hertz, step)).collect();
+                let ask = ends.ask_when_due(plan, &due, |all| all.iter().all(|one| one.response.is_some()));
+                Trace { late_before, ..ask.await? }
             }
         };
+        note_node_exit(node, &mut trace)?;
         // Messages of other topics arrive on other connections, possibly a little later than the last answer.
         let until = At::now() + BESIDES;
         let unheard = |trace: &Trace| {
@@ -101,17 +113,17 @@ impl RobotEndpoints {
             let sent = Instant::now();
             self.publish(step, number)?;
             let until = At::now() + Duration::from_secs_f64(plan.give_up);
-            let mut request =
-                RequestSample { at: (sent - begun).as_secs_f64(), stamp: step.at, ..RequestSample::default() };
+            let at = (sent - begun).as_secs_f64();
+            let mut request = RequestSample { at, stamp: step.at, ..RequestSample::default() };
             if let Some(message) = self.wait_while_running(number, until, node).await {
                 fill_answer(&mut request, &message, sent.elapsed());
                 request.pose = request.pose.filter(|_| plan.tells_pose);
                 request.carried = carried::read_counters()?;
             }
-            let lost = request.response.is_none();
+            let is_lost = request.response.is_none();
             trace.requests.push(request);
             self.collect_other_topics(&mut trace);
-            if lost && note_node_exit(node, &mut trace)? {
+            if is_lost && has_ended(node) {
                 break;
             }
         }
@@ -119,40 +131,55 @@ impl RobotEndpoints {
         Ok(trace)
     }
 
-    async fn ask_as_recorded(
+    /// Publishes each step when it is due, in seconds after the first one, then waits for late answers until `is_over`,
+    /// at most for the plan's time.
+    async fn ask_when_due(
         &mut self,
-        speed: f64,
-        steps: &[&RecordedStep<'_>],
-        node: &mut NodeProcess,
+        plan: &RobotPlan,
+        steps: &[(f64, &RecordedStep<'_>)],
+        is_over: fn(&[RequestSample]) -> bool,
     ) -> Result<Trace> {
         let begun = At::now();
-        let first = steps.first().map_or(0.0, |step| step.at);
         let mut trace = Trace::default();
         let mut sent: Vec<At> = Vec::new();
-        for (index, step) in steps.iter().enumerate() {
-            let due = begun + Duration::from_secs_f64((step.at - first) / speed);
-            self.collect_answers(&mut trace.requests, &sent, due).await;
-            trace.requests.push(RequestSample {
-                at: begun.elapsed().as_secs_f64(),
-                stamp: step.at,
-                ..RequestSample::default()
-            });
+        for (index, (due, step)) in steps.iter().enumerate() {
+            self.collect_answers(&mut trace.requests, &sent, begun + Duration::from_secs_f64(*due)).await;
+            for (_, network) in plan.changes.iter().filter(|(at, _)| *at == index + 1) {
+                request_network(*network)?;
+            }
+            let at = begun.elapsed().as_secs_f64();
+            trace.requests.push(RequestSample { at, stamp: step.at, ..RequestSample::default() });
             sent.push(At::now());
             self.publish(step, FIRST + index as u32)?;
             self.collect_other_topics(&mut trace);
         }
-        let until = At::now() + STRAGGLERS;
-        loop {
-            // The last answer ends the wait: earlier ones will not arrive any more, and its map is on the way.
-            let all = trace.requests.last().is_none_or(|last| last.response.is_some());
-            self.collect_answers(&mut trace.requests, &sent, At::now() + LOOK).await;
-            if all || At::now() > until {
-                break;
-            }
+        let until = At::now() + Duration::from_secs_f64(plan.give_up);
+        while !is_over(&trace.requests) && At::now() < until {
+            self.collect_answers(&mut trace.requests, &sent, until.min(At::now() + LOOK)).await;
         }
-        note_node_exit(node, &mut trace)?;
+        // The last map is on the way.
+        self.collect_answers(&mut trace.requests, &sent, At::now() + LOOK).await;
         trace.lasted = begun.elapsed().as_secs_f64();
         Ok(trace)
+    }
+
+    /// Sends requests at a rate until enough answers in a row are in time, which shows that everything is warmed up;
+    /// returns whether that happened.
+    async fn warm_up(&mut self, steps: &[&RecordedStep<'_>], hertz: f64, in_time: f64) -> Result<bool> {
+        let begun = Instant::now();
+        let (mut awake, mut number) = (0, WARM_UP as u32);
+        while awake < AWAKE {
+            if begun.elapsed() > PATIENCE || number + 1 >= FIRST {
+                return Ok(false);
+            }
+            number += 1;
+            let (step, asked) = (steps[number as usize % steps.len()], At::now());
+            self.publish(step, number)?;
+            let came = self.wait_for_answer(number, Duration::from_secs_f64(in_time)).await;
+            awake = if came.is_some() { awake + 1 } else { 0 };
+            tokio::time::sleep_until(asked + Duration::from_secs_f64(1.0 / hertz)).await;
+        }
+        Ok(true)
     }
 }
 
@@ -196,10 +223,6 @@ pub(super) fn note_node_exit(node: &NodeProcess, trace: &mut Trace) -> Result<bo
     Ok(ended)
 }
 
-/// Returns whether its process has exited.
 pub fn has_ended(node: &NodeProcess) -> bool {
-    let stat = std::fs::read_to_string(format!("/proc/{}/stat", node.pid()));
-    // The state follows the name, which is in parentheses (proc(5)).
-    let state = stat.as_deref().unwrap_or(") X").rsplit(") ").next();
-    state.is_some_and(|state| state.starts_with(['Z', 'X']))
+    !procfs::is_running(node.pid() as i32)
 }

@@ -9,10 +9,9 @@ use ros::ros1::Ros1Bus;
 use support::site::{NodeProcess, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
-use super::RobotPlan;
 use super::answers::{read_grid, record_answer, request_number};
 use super::asking::{LOOK, has_ended};
-use super::numbers::FIRST;
+use super::plan::{FIRST, RobotPlan};
 use crate::recording::{RecordedStep, Recording, read_floats, read_header, with_relative_stamp, with_stamp};
 use crate::trace::{ComputationPhases, RequestSample, Trace};
 
@@ -63,7 +62,6 @@ impl RobotEndpoints {
         Ok(())
     }
 
-    /// Waits for the first answer to a request.
     pub(super) async fn wait_for_answer(&mut self, number: u32, give_up: Duration) -> Option<SerializedMessage> {
         let waited = timeout(give_up, async {
             loop {

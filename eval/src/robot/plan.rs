@@ -6,21 +6,22 @@ use serde::{Deserialize, Serialize};
 
 use crate::network::NetworkProfile;
 
+/// Stamps of measured requests, which are their numbers, are at least this number.
+pub const FIRST: u32 = 1000;
+/// Warm-up requests, which are not counted: after them everything is connected and running.
+pub const WARM_UP: usize = 3;
+
 /// A robot's plan.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct RobotPlan {
     /// Address of the server for its stub; set by the sandbox.
     pub server: String,
-    /// The node that answers.
     pub node: NodeUnderTest,
-    /// A rosbag file.
     pub recording: PathBuf,
     /// Topic of the requests; its messages begin with a header.
     pub request: String,
-    /// Recorded topics that are not inputs.
     pub left_out: Vec<String>,
     /// Recorded topics that `rosbag play` plays in addition to the requests.
-    #[serde(default)]
     pub besides: Vec<String>,
     /// Topic of the answers, each with the header of its request.
     pub answer: String,
@@ -30,19 +31,40 @@ pub struct RobotPlan {
     pub timing: Option<String>,
     /// A topic of `nav_msgs/OccupancyGrid`.
     pub map: Option<String>,
-    /// When requests are published.
     pub pace: RequestPacing,
     /// Interval at which recorded requests are used: every n-th one.
     pub every: usize,
-    /// Maximum number of requests, without the warm-up.
     pub most: usize,
     /// Seconds after which a request counts as unanswered.
     pub give_up: f64,
     /// Seconds after which the whole run counts as failed.
     pub patience: f64,
     /// For requests at a rate: before which request, counted from 1, the network changes, and to which one.
-    #[serde(default)]
     pub changes: Vec<(usize, NetworkProfile)>,
+}
+
+impl RobotPlan {
+    /// Creates the plan of a robot that makes one request after the other.
+    pub fn new(node: NodeUnderTest, recording: PathBuf, request: &str, answer: &str) -> Self {
+        Self {
+            server: String::new(),
+            node,
+            recording,
+            request: request.to_owned(),
+            left_out: Vec::new(),
+            besides: Vec::new(),
+            answer: answer.to_owned(),
+            tells_pose: false,
+            timing: None,
+            map: None,
+            pace: RequestPacing::OneByOne,
+            every: 1,
+            most: 1,
+            give_up: 30.0,
+            patience: 600.0,
+            changes: Vec::new(),
+        }
+    }
 }
 
 /// Pacing of the requests.
@@ -51,13 +73,10 @@ pub struct RobotPlan {
 pub enum RequestPacing {
     /// Each request after the answer to the previous one.
     OneByOne,
-    /// At the recorded times, divided by this factor.
     Recorded(f64),
     /// At a fixed rate, repeating the recording, once some warm-up requests were answered in time.
     Rate {
-        /// Requests per second.
         hertz: f64,
-        /// Seconds within which an answer is in time.
         in_time: f64,
     },
     /// By `rosbag play`, at its own rate and with its own stamps, for this number of seconds of the recording.
@@ -72,23 +91,16 @@ pub enum NodeUnderTest {
     Native {
         /// Shell commands that execute their arguments there.
         script: String,
-        /// The node's program in that file system.
         program: String,
-        /// Arguments of the program.
         argv: Vec<String>,
     },
-    /// A stub of the package.
     Stub {
-        /// Name of the package.
         package: String,
-        /// The node's executable.
         executable: String,
-        /// Arguments of the executable.
         argv: Vec<String>,
         /// Lines of `stub.toml` besides the server's address.
         settings: String,
         /// Environment variables.
-        #[serde(default)]
         environment: Vec<(String, String)>,
     },
 }

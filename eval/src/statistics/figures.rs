@@ -1,15 +1,29 @@
-//! Descriptive statistics: means, deviations, intervals, and linear regression.
+//! Descriptive statistics: means, deviations, the spread of repeated runs, and linear regression.
 
-use std::iter::repeat_n;
+use bench_report::sort_values;
 
-use bench_report::{quantile, quantile_of_sorted, sort_values};
-use rand::rngs::StdRng;
-use rand::{Rng, SeedableRng};
+use super::median;
 
-/// Resamples of a bootstrap.
-const RESAMPLES: usize = 2000;
+/// The median of the runs of one measurement, with the lowest and the highest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spread {
+    pub low: f64,
+    pub median: f64,
+    pub high: f64,
+}
 
-/// Arithmetic mean.
+impl Spread {
+    pub fn from_values(values: &[f64]) -> Option<Self> {
+        let sorted = sort_values(values)?;
+        Some(Self { low: *sorted.first()?, median: median(&sorted)?, high: *sorted.last()? })
+    }
+
+    /// Returns whether all runs exceed all of another measurement, so that the difference is more than chance.
+    pub fn is_above(self, other: Self) -> bool {
+        self.low > other.high
+    }
+}
+
 pub fn mean(values: &[f64]) -> Option<f64> {
     let sum: f64 = values.iter().sum();
     (!values.is_empty() && !sum.is_nan()).then(|| sum / values.len() as f64)
@@ -23,30 +37,9 @@ pub fn standard_deviation(values: &[f64]) -> Option<f64> {
     (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
 }
 
-/// Confidence interval of the median, low and high, by the percentile bootstrap (Efron and Tibshirani, "An Introduction
-/// to the Bootstrap", 1993, chapter 13). `confidence` is between 0 and 1, such as 0.95. The same values give the same
-/// interval.
-pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
-    let values = sort_values(values)?;
-    let mut random = StdRng::seed_from_u64(0);
-    let mut medians = Vec::with_capacity(RESAMPLES);
-    for _ in 0..RESAMPLES {
-        let mut drawn = vec![0; values.len()];
-        for _ in 0..values.len() {
-            drawn[random.random_range(0..values.len())] += 1;
-        }
-        let times = values.iter().zip(drawn);
-        let resample: Vec<f64> = times.flat_map(|(value, times)| repeat_n(*value, times)).collect();
-        medians.push(quantile_of_sorted(&resample, 0.5)?);
-    }
-    let outside = (1.0 - confidence) / 2.0;
-    Some((quantile(&medians, outside)?, quantile(&medians, 1.0 - outside)?))
-}
-
 /// A straight line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FittedLine {
-    /// Change of y per unit of x.
     pub slope: f64,
     /// y at x = 0.
     pub intercept: f64,
@@ -85,16 +78,13 @@ mod tests {
         assert_eq!(standard_deviation(&[1.0, f64::INFINITY]), None);
     }
 
-    /// For the median of 1…100 the interval by order statistics (binomial) is from the 40th to the 61st value.
     #[test]
-    fn the_medians_interval_is_that_of_order_statistics() {
-        let values: Vec<f64> = (1..=100).map(f64::from).collect();
-        let (low, high) = median_interval(&values, 0.95).expect("values");
-        assert!((38.0..=43.0).contains(&low), "{low}");
-        assert!((58.0..=63.0).contains(&high), "{high}");
-        assert_eq!(median_interval(&values, 0.95), Some((low, high)));
-        assert_eq!(median_interval(&[3.0, 3.0], 0.95), Some((3.0, 3.0)));
-        assert_eq!(median_interval(&[], 0.95), None);
+    fn runs_have_a_median_and_a_spread() {
+        let spread = Spread::from_values(&[3.0, 1.0, 2.0]).expect("values");
+        assert_eq!((spread.low, spread.median, spread.high), (1.0, 2.0, 3.0));
+        assert_eq!(Spread::from_values(&[]), None);
+        let above = Spread::from_values(&[3.5, 9.0]).expect("values");
+        assert!(above.is_above(spread) && !spread.is_above(above) && !spread.is_above(spread));
     }
 
     #[test]

@@ -12,7 +12,6 @@ const STEPS: u32 = 400;
 /// describes one program; another program has other work.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RrtModel {
-    /// Seconds that do not depend on the cores.
     pub overhead: f64,
     /// Core seconds of computation per request.
     pub work: f64,

@@ -78,7 +78,6 @@ mod tests {
     use super::super::assert_near;
     use super::*;
 
-    /// An asymmetric figure of eight.
     fn path() -> Vec<(f64, f64, f64)> {
         (0..200)
             .map(|index| {

@@ -5,7 +5,6 @@
 pub struct QueuePrediction {
     /// Seconds from a request to its answer, without the network.
     pub response: f64,
-    /// Requests per second of all robots together.
     pub throughput: f64,
     /// Fraction of core time in use, 0 to 1.
     pub busy: f64,
@@ -45,36 +44,9 @@ pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> Queu
     QueuePrediction { response: robots as f64 / throughput - think, throughput, busy: used / cores }
 }
 
-/// Returns the response time of [`machine_repair`], in seconds.
-pub fn response_time(robots: u64, cores: f64, service: f64, think: f64) -> f64 {
-    machine_repair(robots, cores, service, think).response
-}
-
-/// Returns how many of `robots` a node can serve with a mean response time of at most `t_max` seconds.
-pub fn robots_per_node(robots: u64, cores: f64, service: f64, think: f64, t_max: f64) -> u64 {
-    // The response time grows with the number of robots.
-    let in_time = |robots: u64| response_time(robots, cores, service, think) <= t_max;
-    let (mut enough, mut beyond) = (0, 1);
-    while beyond <= robots && in_time(beyond) {
-        enough = beyond;
-        beyond *= 2;
-    }
-    beyond = beyond.min(robots + 1);
-    while beyond - enough > 1 {
-        let middle = enough + (beyond - enough) / 2;
-        if in_time(middle) {
-            enough = middle;
-        } else {
-            beyond = middle;
-        }
-    }
-    enough
-}
-
 /// Measurements of robots at a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct QueueObservation {
-    /// Number of robots.
     pub robots: u64,
     /// Mean of their response times, in seconds.
     pub response: f64,
@@ -86,7 +58,6 @@ pub struct QueueObservation {
 /// of the node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NodeModel {
-    /// Number of cores.
     pub cores: f64,
     /// Mean pause in seconds between an answer and the robot's next request.
     pub think: f64,
@@ -153,7 +124,17 @@ impl NodeModel {
 
     /// Returns how many of `robots` it serves with a mean response time of at most `t_max` seconds.
     pub fn robots_served(&self, robots: u64, t_max: f64) -> u64 {
-        robots_per_node(robots, self.cores, self.service, self.think + self.delay, t_max - self.delay)
+        // The response time grows with the number of robots.
+        let (mut enough, mut beyond) = (0, robots + 1);
+        while beyond - enough > 1 {
+            let middle = enough + (beyond - enough) / 2;
+            if self.predict(middle).response <= t_max {
+                enough = middle;
+            } else {
+                beyond = middle;
+            }
+        }
+        enough
     }
 
     /// Returns the number of robots above which they wait for one another rather than for their own requests: the
@@ -215,7 +196,12 @@ mod tests {
     #[test]
     fn robots_that_are_served_in_time_are_counted() {
         assert_near(response_time(3, 1.0, 1.0, 1.0), 2.2);
-        assert_eq!(robots_per_node(100, 1.0, 1.0, 1.0, 1.6), 2);
+        let node = NodeModel { cores: 1.0, think: 1.0, service: 1.0, delay: 0.0 };
+        assert_eq!(node.robots_served(100, 1.6), 2);
+    }
+
+    fn response_time(robots: u64, cores: f64, service: f64, think: f64) -> f64 {
+        machine_repair(robots, cores, service, think).response
     }
 
     const NODE: NodeModel = NodeModel { cores: 2.0, think: 0.2, service: 0.01, delay: 0.003 };

@@ -112,3 +112,34 @@ pub(super) const DEFINITIONS: &[Repeat] = &[
     repeat("Y y\n", "===\nMSG: b/Y{n}\nint8 a\n", ""),
     repeat("", "#\n", ""),
 ];
+
+pub(super) const SAVED: &[Repeat] = &[
+    repeat("[{\"Config\":\"config.json\",\"Layers\":[", "\"\",", "\"\"]}]"),
+    repeat("[", "{\"Config\":\"\",\"Layers\":[]},", "{\"Config\":\"\",\"Layers\":[]}]"),
+    repeat("{\"manifests\":[{\"annotations\":{", "\"{n}\":\"\",", "\"\":\"\"}}]}"),
+    repeat(
+        "[{\"Config\":\"config.json\",\"Layers\":[]}]\0{\"rootfs\":{\"diff_ids\":[]},\"config\":{\"Env\":[",
+        "\"\",",
+        "\"\"]}}",
+    ),
+];
+
+pub(super) const MANIFESTS: &[Repeat] = &[
+    repeat("<package format=\"2\"><name>a</name>", "<depend>a{n}</depend>", "</package>"),
+    repeat("<package><name>a</name>", "<a/>", "</package>"),
+    repeat("<package><name>a</name><export ", "a{n}=\"\" ", "/></package>"),
+    repeat("<package>", "<a>", ""),
+    repeat("<package>", "<a xmlns:b{n}=\"u\">", ""),
+    repeat("<package><name>a</name><description>", "&lt;", "</description></package>"),
+    repeat("<package format=\"3\"><name>a</name><depend condition=\"a", " == a and a", "\">b</depend></package>"),
+    repeat("<package format=\"3\"><name>a</name><depend condition=\"", "(", "\">b</depend></package>"),
+];
+
+pub(super) const INTERFACES: &[Repeat] = &[
+    repeat("", "[[topics]]\n", ""),
+    repeat("", "a{n}=1\n", ""),
+    repeat("[[parameters]]\nname=\"/a\"\nvalue=[", "1,", "]\n"),
+    repeat("[[parameters]]\nname=\"/a\"\nvalue=[", "{},", "]\n"),
+    repeat("[[parameters]]\nname=\"/a\"\nvalue=", "[", ""),
+    repeat("[[needs]]\nname=\"/a\"\nnodes=[", "\"/b\",", "]\n"),
+];

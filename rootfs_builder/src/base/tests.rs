@@ -80,6 +80,10 @@ fn mistakes_are_named_with_their_line() {
         (SMALLEST.replace("ros1", "ros7"), "line 4"),
         (format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"), "line 12"),
         (format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"), "line 12"),
+        (
+            format!("{SMALLEST}[environment]\nRMW_IMPLEMENTATION = \"rmw_zenoh_cpp\"\n").replace("ros1", "ros2"),
+            "line 12: environment: rmw_zenoh_cpp speaks Zenoh",
+        ),
     ];
     for (text, line) in cases {
         let problem = parse(&text).expect_err("a mistake").to_string();
@@ -89,12 +93,40 @@ fn mistakes_are_named_with_their_line() {
 
 #[test]
 fn there_are_bases_of_both_versions_of_ros() {
-    for (name, ros, distribution) in
-        [("bookworm-ros1", Version::Ros1, "noetic"), ("bookworm-jazzy-wheels", Version::Ros2, "jazzy")]
-    {
+    for (name, ros, distribution) in [
+        ("bookworm-ros1", Version::Ros1, "noetic"),
+        ("bookworm-jazzy-wheels", Version::Ros2, "jazzy"),
+        ("bookworm-kilted-wheels", Version::Ros2, "kilted"),
+    ] {
         let flavour = load(&repository_bases(), name).expect("valid").flavour();
         assert_eq!((flavour.ros, &*flavour.distribution), (ros, distribution));
     }
+}
+
+#[test]
+fn both_bases_of_wheels_have_the_same_packages_and_settings() {
+    let [jazzy, kilted] =
+        ["jazzy", "kilted"].map(|name| load(&repository_bases(), &format!("bookworm-{name}-wheels")).expect("valid"));
+    let names = |base: &Base| -> BTreeSet<String> {
+        let lists = [&base.required.runtime, &base.required.build];
+        let lines = lists.into_iter().flat_map(|list| list.text().lines());
+        lines.filter_map(|line| Some(line.split_once("==")?.0.to_owned())).collect()
+    };
+    let only = |one: &Base, other: &Base| -> Vec<String> { names(one).difference(&names(other)).cloned().collect() };
+    // Kilted's Fast DDS has another name, and what was one package is two, or is not needed any more.
+    let gone = ["ros-domain-coordinator", "ros-fastrtps", "ros-fastrtps-cmake-module", "ros-python-cmake-module"];
+    assert_eq!(only(&jazzy, &kilted), gone);
+    assert_eq!(only(&kilted, &jazzy), ["ros-ament-cmake-ros-core", "ros-fastdds", "ros-rmw-security-common"]);
+    assert_eq!((&jazzy.keys, &jazzy.ros_packages.ignore), (&kilted.keys, &kilted.ros_packages.ignore));
+    assert_eq!(jazzy.keys["osrf_pycommon"], ["python3-osrf-pycommon"]);
+    let rename = |values: &BTreeMap<String, String>| -> BTreeMap<String, String> {
+        values.iter().map(|(name, value)| (name.clone(), value.replace("jazzy", "kilted"))).collect()
+    };
+    assert_eq!(rename(&jazzy.environment), kilted.environment);
+    // CMake and compilers need these to build C++ against the wheels.
+    let rewrite = |base: &Base| base.wheels.as_ref().expect("wheels").rewrite.clone();
+    assert_eq!(rename(&rewrite(&jazzy)), rewrite(&kilted));
+    assert_eq!(jazzy.build.environment, kilted.build.environment);
 }
 
 /// Creates a directory with these files.

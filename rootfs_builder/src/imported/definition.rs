@@ -44,10 +44,10 @@ const COLCON_OF_ROS: &str = "python3-colcon-common-extensions";
 
 /// Returns the tools that sources are compiled with.
 fn needed_tools(system: &FoundSystem) -> &'static [Tool] {
-    const ONE: [Tool; 6] = [COMPILER, CMAKE, MAKE, SETUPTOOLS, CATKIN_PKG, EMPY];
+    const TOOLS_OF_ROS1: [Tool; 6] = [COMPILER, CMAKE, MAKE, SETUPTOOLS, CATKIN_PKG, EMPY];
     const TWO: [Tool; 6] = [COMPILER, CMAKE, MAKE, SETUPTOOLS, CATKIN_PKG, COLCON];
     match version(system) {
-        Version::Ros1 => &ONE,
+        Version::Ros1 => &TOOLS_OF_ROS1,
         Version::Ros2 => &TWO,
     }
 }
@@ -92,7 +92,7 @@ pub(super) fn installs_python(system: &FoundSystem) -> bool {
 
 /// Returns the Debian packages with what is missing; empty where dpkg is missing, too.
 fn tool_packages(system: &FoundSystem) -> Vec<String> {
-    if system.dpkg_status.is_none() {
+    if system.debian.is_none() {
         return Vec::new();
     }
     let mut debs: Vec<String> = list_missing_tools(system).map(|tool| tool.deb.to_owned()).collect();

@@ -1,16 +1,22 @@
 //! The table of what was found in an image, in words for the person who imports it.
 
-use package::system::{FoundSystem, MIDDLEWARES, RosSpace};
+use std::collections::BTreeMap;
+
+use package::system::{self, FoundSystem, RosSpace};
 use ros::flavour::Version;
+use ros::ros2::middleware;
 
 use super::definition::{find_missing_tools, installs_python, version};
 use crate::base::Finding;
 
-/// Returns the table. `debs`: number of packages of dpkg.
-pub(super) fn list_findings(system: &FoundSystem, debs: usize) -> Vec<Finding> {
+/// Returns the table. `given`: environment that the image sets; `debs`: number of packages of dpkg.
+pub(super) fn list_findings(system: &FoundSystem, given: &BTreeMap<String, String>, debs: usize) -> Vec<Finding> {
     let release = format!("{} ({} {})", system.title, system.distribution, system.suite);
     let mut all = vec![Finding::new("system", release, "")];
     all.extend(describe_ros(system));
+    if version(system) == Version::Ros2 {
+        all.push(describe_middleware(system, given));
+    }
     for (path, why) in &system.unusable {
         all.push(Finding::new("left out", path.as_str(), *why));
     }
@@ -40,17 +46,19 @@ fn describe_ros(system: &FoundSystem) -> Vec<Finding> {
         let named = if all.is_empty() { format!("{named} in ") } else { String::new() };
         all.push(Finding::new(subject, format!("{named}{path}, {} packages", packages.len()), ""));
     }
-    if version(system) == Version::Ros2 {
-        all.push(match system.first_package(&MIDDLEWARES) {
-            Some(name) => Finding::new("middleware", name, ""),
-            None => Finding::new(
-                "middleware",
-                format!("missing: {}", MIDDLEWARES.join(" or ")),
-                "nodes cannot be reached by robots: add one to the image",
-            ),
-        });
-    }
     all
+}
+
+fn describe_middleware(system: &FoundSystem, given: &BTreeMap<String, String>) -> Finding {
+    let Some(name) = system::choose_middleware(system, given) else {
+        let missing = format!("missing: {}", middleware::SUPPORTED.join(" or "));
+        return Finding::new("middleware", missing, "nodes cannot be reached by robots: add one to the image");
+    };
+    let consequence = match middleware::check_environment(given) {
+        Ok(()) => String::new(),
+        Err(error) => format!("instead of the one that the image sets: {error}"),
+    };
+    Finding::new("middleware", name, consequence)
 }
 
 fn describe_tools(system: &FoundSystem, has_dpkg: bool) -> Finding {

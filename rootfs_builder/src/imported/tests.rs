@@ -51,10 +51,15 @@ impl ImportFixture {
 
     /// Returns a request to import a tree as an image of one layer.
     fn save_image(&self, name: &str, tree: &str) -> BaseImport {
+        self.save_image_with(name, tree, &[("MODEL", "large")])
+    }
+
+    /// Returns a request to import a tree as an image of one layer with this environment.
+    fn save_image_with(&self, name: &str, tree: &str, env: &[(&str, &str)]) -> BaseImport {
         let sender = self.place.path().join(format!("sender-{tree}"));
         let store = Store::open(&sender.join("images"), &sender.join("layers")).expect("a store");
         let layer = store.layer_from_tree(&self.place.path().join(tree), &TreeOptions::default()).expect("a layer");
-        let env = BTreeMap::from([("MODEL".to_owned(), "large".to_owned())]);
+        let env = env.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect();
         let image = store.put_image(&ImageSpec { layers: vec![layer], env, ..ImageSpec::default() }).expect("an image");
         store.tag("lab/ros:jazzy", &image).expect("a tag");
         BaseImport {
@@ -152,6 +157,24 @@ fn an_image_with_all_tools_compiles_and_one_without_dpkg_is_as_it_is() {
     assert!(image.installs_python && image.debian.is_empty() && bare.build.packages.is_empty());
     let compiling = image.findings.iter().find(|finding| finding.subject == "compiling").expect("a row");
     assert_eq!(compiling.consequence, "packages in Python and install spaces can be pushed");
+}
+
+#[test]
+fn an_image_whose_nodes_would_speak_zenoh_uses_what_it_has_besides() {
+    let lab = new_fixture();
+    let zenoh = [("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")];
+    lab.write_root("alone", &["rclpy", "rmw_zenoh_cpp"]);
+    let refused = lab.import(&lab.save_image_with("lab", "alone", &zenoh)).expect_err("nobody speaks it").to_string();
+    assert!(refused.contains("rmw_zenoh_cpp alone") && refused.contains("add rmw_fastrtps_cpp"), "{refused}");
+    assert!(matches!(lab.builder.base("lab"), Err(Error::UnknownBase { .. })));
+    lab.write_root("both", &["rclpy", "rmw_zenoh_cpp", "rmw_cyclonedds_cpp"]);
+    lab.import(&lab.save_image_with("lab", "both", &zenoh)).expect("there is another");
+    let base = lab.load_base("lab");
+    assert_eq!(base.environment["RMW_IMPLEMENTATION"], "rmw_cyclonedds_cpp");
+    let image = base.image.as_ref().expect("an image");
+    let row = image.findings.iter().find(|finding| finding.subject == "middleware").expect("a row");
+    assert_eq!(row.found, "rmw_cyclonedds_cpp");
+    assert!(row.consequence.contains("the image sets: rmw_zenoh_cpp speaks Zenoh"), "{}", row.consequence);
 }
 
 #[test]

@@ -13,6 +13,7 @@ import os
 import py_compile
 import re
 import stat
+import struct
 import sys
 import zipfile
 
@@ -22,6 +23,14 @@ from %s import %s
 if __name__ == "__main__":
     sys.exit(%s())
 """
+
+# How the libraries of generated Python modules are called.
+OF_PYTHON = "__rosidl_generator_py.so"
+# The ELF format (System V gABI, chapter 5): types of segments, tags of the dynamic section.
+PT_LOAD = 1
+PT_DYNAMIC = 2
+DT_NEEDED = 1
+DT_STRTAB = 5
 
 
 class Prefix:
@@ -80,6 +89,8 @@ def install(directory, wheel, prefix):
             if scheme == "scripts" and data.startswith(b"#!python"):
                 _, end, rest = data.partition(b"\n")
                 data = b"#!" + sys.executable.encode() + end + rest
+            if os.path.dirname(place) == os.path.join(prefix.path, "lib") and not place.endswith(OF_PYTHON):
+                data = without_python(data)
             if place.endswith(".cmake"):
                 for old, new in prefix.rewrite:
                     data = data.replace(old.encode(), new.encode())
@@ -91,6 +102,36 @@ def install(directory, wheel, prefix):
                 if points.has_section("console_scripts"):
                     for name, target in points.items("console_scripts"):
                         prefix.program(name, target.split("[")[0].strip())
+
+
+def without_python(data):
+    """A library, such as librcl.so, without what it is linked with and does not use: libraries of generated Python modules, which
+    only Python can load, so that no program in C++ could load it. Their entries name another library that it needs once more."""
+    if not data.startswith(b"\x7fELF\x02\x01"):
+        return data
+    (table,) = struct.unpack_from("<Q", data, 32)
+    size, count = struct.unpack_from("<HH", data, 54)
+    headers = [struct.unpack_from("<IIQQQQQQ", data, table + size * index) for index in range(count)]
+    entries = []
+    for kind, _, offset, _, _, length, _, _ in headers:
+        if kind == PT_DYNAMIC:
+            entries = [(at + 8, *struct.unpack_from("<qQ", data, at)) for at in range(offset, offset + length, 16)]
+    strings = 0
+    for _, tag, address in entries:
+        for kind, _, offset, start, _, length, _, _ in headers:
+            if tag == DT_STRTAB and kind == PT_LOAD and start <= address < start + length:
+                strings = offset + address - start
+    needed = [(at, value) for at, tag, value in entries if tag == DT_NEEDED]
+    ending = OF_PYTHON.encode() + b"\0"
+    names = {value: data[strings + value : data.index(b"\0", strings + value) + 1] for _, value in needed}
+    others = [value for _, value in needed if not names[value].endswith(ending)]
+    if not others:
+        return data
+    changed = bytearray(data)
+    for at, value in needed:
+        if names[value].endswith(ending):
+            struct.pack_into("<Q", changed, at, others[0])
+    return bytes(changed)
 
 
 def share_libraries(prefix):

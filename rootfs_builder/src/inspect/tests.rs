@@ -99,3 +99,33 @@ async fn on_ros_2_the_bases_packages_are_those_of_the_last_build() {
     let map = BTreeMap::from([("warp_drive".to_owned(), "python3-scipy".to_owned())]);
     inspect(&builder, &PushRequest { map, ..request }).await.expect("it is mapped");
 }
+
+#[tokio::test]
+async fn a_middleware_that_robots_do_not_speak_is_refused_before_the_build() {
+    let place = tempfile::tempdir().expect("a directory");
+    let builder = new_builder(place.path());
+    put_archive(&builder, WHEELS, place.path(), ("", &["ros-jazzy-rmw-zenoh-cpp"])).await;
+    let tree = place.path().join("pushed");
+    write_python(&tree, "app", "<depend>rclpy</depend><exec_depend>rmw_zenoh_cpp</exec_depend>");
+    let depending = push(&tree, WHEELS);
+    let refused = inspect(&builder, &depending).await.expect_err("it is not DDS").to_string();
+    assert!(refused.starts_with("package app depends on rmw_zenoh_cpp at run time: "), "{refused}");
+    assert!(refused.ends_with("push with `--map rmw_zenoh_cpp=`"), "{refused}");
+    let map = [("rmw_zenoh_cpp".to_owned(), String::new())].into();
+    let request = PushRequest { map, ..depending };
+    inspect(&builder, &request).await.expect("nodes run with Fast DDS");
+
+    let launch = |text: &str| {
+        let path = tree.join("src/app/launch/go.launch.py");
+        std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+        std::fs::write(path, text).expect("written");
+        PushRequest { launch: Some("go.launch.py".to_owned()), nodes: Vec::new(), ..request.clone() }
+    };
+    let set = "SetEnvironmentVariable('RMW_IMPLEMENTATION', 'rmw_zenoh_cpp')\n";
+    let refused = inspect(&builder, &launch(set)).await.expect_err("it is not DDS").to_string();
+    let by = "launch file launch/go.launch.py sets RMW_IMPLEMENTATION: rmw_zenoh_cpp speaks Zenoh";
+    assert!(refused.starts_with(by) && refused.contains("set it to rmw_fastrtps_cpp"), "{refused}");
+    inspect(&builder, &launch(&set.replace("zenoh", "cyclonedds"))).await.expect("DDS");
+    let with = PushRequest { with: vec!["ros-jazzy-rmw-zenoh-cpp".to_owned()], ..request };
+    inspect(&builder, &with).await.expect_err("it is not DDS");
+}

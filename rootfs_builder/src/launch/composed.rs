@@ -2,13 +2,13 @@
 
 use serde_json::{Value, json};
 
-use super::of_two::{Ros2Fixture, argv, evaluate};
+use super::ros2_tests::{Ros2Fixture, argv, evaluate};
 use super::*;
 
 /// Recorded output of the scripts for a launch file with two containers, with launch_ros 0.26. Of the components of the
 /// first container one is loaded by a separate action before it, and one has a condition that is false; the second
 /// container is in a group.
-const RECORDED: &[u8] = include_bytes!("composed.json");
+const RECORDED_CONTAINERS: &[u8] = include_bytes!("composed.json");
 
 fn parse_plan(text: &[u8]) -> LaunchAnswer {
     let answer = parse_reply(text, Version::Ros2).expect("a plan");
@@ -24,7 +24,7 @@ fn value(component: &Component, name: &str) -> Value {
 
 #[test]
 fn a_plan_says_what_is_loaded_into_which_container() {
-    let answer = parse_plan(RECORDED);
+    let answer = parse_plan(RECORDED_CONTAINERS);
     let nodes: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(nodes, ["/box", "/deep/two"]);
     let [listener, talker] = &answer.components["/box"][..] else { panic!("two nodes: {:?}", answer.components) };
@@ -51,7 +51,7 @@ fn a_plan_says_what_is_loaded_into_which_container() {
 
 #[test]
 fn what_is_loaded_must_be_defined_in_the_image() {
-    let answer = parse_plan(RECORDED);
+    let answer = parse_plan(RECORDED_CONTAINERS);
     let mut definitions = Definitions::new();
     let refused = check_composition(&answer.components, &definitions).expect_err("no definition");
     let words = refused.to_string();

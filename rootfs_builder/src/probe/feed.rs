@@ -25,8 +25,8 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::frames::{self, FrameSet};
-use super::heard::{Stamp, read_stamp};
 use super::lender::AnyServiceLender;
+use super::output_messages::{Stamp, read_stamp};
 use super::{ProbeOptions, plausible, settle};
 
 /// Time limit for a node to report the type of an input, and to connect, in its own time.

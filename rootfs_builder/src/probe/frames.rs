@@ -28,7 +28,7 @@ const USUAL: [&str; 13] = [
     "imu_link",
 ];
 /// Maximum number of frames, since a node could name arbitrarily many.
-const MOST: usize = 256;
+const MAX_FRAMES: usize = 256;
 
 /// Known frames.
 #[derive(Debug, Clone)]
@@ -44,7 +44,7 @@ impl FrameSet {
     /// Adds a frame; returns whether it is new.
     pub(super) fn add(&mut self, name: &str) -> bool {
         let name = name.trim_start_matches('/');
-        self.0.len() < MOST && is_name(name) && self.0.insert(name.to_owned())
+        self.0.len() < MAX_FRAMES && is_name(name) && self.0.insert(name.to_owned())
     }
 
     /// Adds the frames named in a log line; returns whether any is new.
@@ -84,7 +84,7 @@ fn is_name(text: &str) -> bool {
 /// Returns the likely frame names in a line about transforms: words in quotes, words with an underscore, and words
 /// after `from`, `to`, `frame` and the like.
 fn parse_frame_names(line: &str) -> BTreeSet<String> {
-    const BEFORE: [&str; 9] =
+    const FRAME_WORDS: [&str; 9] =
         ["from", "to", "frame", "frames", "frame_id", "id", "target_frame", "source_frame", "and"];
     const NEVER: [&str; 14] = [
         "to",
@@ -111,7 +111,7 @@ fn parse_frame_names(line: &str) -> BTreeSet<String> {
     for word in line.split_whitespace() {
         let bare = word.trim_matches(|char: char| !char.is_ascii_alphanumeric() && char != '_');
         let quoted = word.starts_with(['"', '\'', '[', '`']);
-        let likely = quoted || bare.contains('_') || BEFORE.contains(&before.as_str());
+        let likely = quoted || bare.contains('_') || FRAME_WORDS.contains(&before.as_str());
         if likely && is_name(bare) && !NEVER.contains(&bare) {
             names.insert(bare.to_owned());
         }

@@ -76,7 +76,7 @@ struct ClockReading {
 }
 
 /// Threads that wait together may wait longer than time elapses: at least 1/20 of the elapsed time always counts.
-const LEAST: u32 = 20;
+const COUNTED_DIVISOR: u32 = 20;
 
 impl NodeClock {
     async fn start(options: &ProbeOptions) -> Self {
@@ -95,7 +95,7 @@ impl NodeClock {
             _ => Default::default(),
         };
         *self = Self { at, worked };
-        let time = elapsed.saturating_sub(waited).max(elapsed / LEAST);
+        let time = elapsed.saturating_sub(waited).max(elapsed / COUNTED_DIVISOR);
         ClockReading { time, ran }
     }
 }
@@ -111,7 +111,7 @@ pub(super) async fn await_answer<T>(
     let mut left = limit;
     tokio::pin!(answer);
     loop {
-        let until = Instant::now() + left.max(options.settle / LEAST);
+        let until = Instant::now() + left.max(options.settle / COUNTED_DIVISOR);
         if let Ok(answer) = timeout_at(until.min(latest), answer.as_mut()).await {
             return Some(answer);
         }
@@ -143,7 +143,7 @@ pub async fn wait_until_still(
     let (mut silent, mut ran) = (Duration::ZERO, Duration::ZERO);
     loop {
         let pause = options.settle.saturating_sub(silent);
-        let until = Instant::now() + pause.max(options.settle / LEAST);
+        let until = Instant::now() + pause.max(options.settle / COUNTED_DIVISOR);
         let changed = wait_for_news(watch, &mut shown, &options.own_name, until.min(latest)).await?;
         let past = clock.read(options).await;
         total += past.time;
@@ -197,7 +197,7 @@ enum ShownName {
     ActionClient(String),
     Sought(String),
     Parameter(String),
-    /// Without the number of an anonymous node.
+    /// Name of a node, without the number of an anonymous one.
     Node(String),
 }
 
@@ -244,10 +244,10 @@ impl ShownNames {
 /// hexadecimal number behind an underscore (`transform_listener_impl_55d0a8e1f2b0`, of tf2_ros).
 fn without_number(node: &str) -> &str {
     /// Length from which letters up to `f` beside digits are taken for a number.
-    const LONG: usize = 4;
+    const MIN_HEX_LENGTH: usize = 4;
     let is_number = |end: &str| {
         let digits = end.bytes().filter(u8::is_ascii_digit).count();
-        digits > 0 && end.len() >= LONG && end.bytes().all(|it| it.is_ascii_hexdigit())
+        digits > 0 && end.len() >= MIN_HEX_LENGTH && end.bytes().all(|it| it.is_ascii_hexdigit())
     };
     match node.rsplit_once('_') {
         Some((before, number)) if is_number(number) => before,

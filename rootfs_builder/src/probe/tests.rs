@@ -17,7 +17,7 @@ mod loading;
 mod memory_bus;
 #[path = "../../../tests/support/memory_container.rs"]
 mod memory_container;
-mod of_two;
+mod ros2_nodes;
 
 const STRING: (&str, &str) = ("std_msgs/msg/String", "string data\n");
 const ADD: (&str, &str) = ("lab/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n");

@@ -149,3 +149,38 @@ fn wheels_that_contradict_each_other_or_leave_the_prefix_are_refused() {
     let said = WheelFixture::new(&[(one, &[same]), (two, &[same])]).install();
     assert!(said.status.success(), "{said:?}");
 }
+
+/// Links a shared library with others of its directory, used or not.
+fn link_library(directory: &Path, name: &str, with: &[&str]) {
+    let mut compiler = std::process::Command::new("cc");
+    compiler.args(["-shared", "-fPIC", "-nostdlib", "-x", "c", "/dev/null", "-x", "none", "-Wl,--no-as-needed", "-o"]);
+    let linked = compiler.arg(name).args(with).current_dir(directory).output().expect("cc runs");
+    assert!(linked.status.success(), "{linked:?}");
+}
+
+#[test]
+fn libraries_that_use_no_python_can_be_loaded_without_it() {
+    const OF_MODULE: &str = "libx_msgs__rosidl_generator_py.so";
+    for (name, needs) in [
+        ("librcl.so", &["libbase.so"][..]),
+        // Libraries of modules use one another.
+        ("liby_msgs__rosidl_generator_py.so", &["libbase.so", OF_MODULE]),
+    ] {
+        let mut lab = WheelFixture::new(&[]);
+        let library = lab.place.path().join("ros_a-1.0.data/data/lib");
+        fs::create_dir_all(&library).expect("made");
+        for (name, with) in [("libbase.so", &[][..]), (OF_MODULE, &[]), (name, &[OF_MODULE, "libbase.so"])] {
+            link_library(&library, name, with);
+        }
+        fs::remove_file(library.join("libbase.so")).expect("removed");
+        fs::remove_file(library.join(OF_MODULE)).expect("removed");
+        let mut zip = std::process::Command::new("/usr/bin/python3");
+        let packed = zip.args(["-m", "zipfile", "-c", "ros_a-1.0-py3-none-any.whl", "ros_a-1.0.data"]);
+        assert!(packed.current_dir(lab.place.path()).status().expect("Python runs").success());
+        lab.wheels.push("ros_a-1.0-py3-none-any.whl");
+        let said = lab.install();
+        assert!(said.status.success(), "{said:?}");
+        let found = crate::elf::needed_libraries(&lab.prefix()).expect("read");
+        assert!(found.iter().eq(needs), "{name}: {found:?}");
+    }
+}

@@ -26,9 +26,9 @@ const WIDER: u32 = 16;
 const SHORTEST: Millis = 1_000;
 const LONGEST: Millis = 60_000;
 /// Time after the last failure when an entry expires.
-const FORGOTTEN: Millis = 600_000;
+const EXPIRY: Millis = 600_000;
 /// Maximum number of entries: addresses and networks, or accounts.
-pub const REMEMBERED: usize = 8_192;
+pub const MAX_ENTRIES: usize = 8_192;
 
 /// Failures of one address, network or account.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -39,7 +39,7 @@ struct FailureRecord {
 
 impl FailureRecord {
     fn is_forgotten(&self, now: Millis) -> bool {
-        now.saturating_sub(self.last) >= FORGOTTEN
+        now.saturating_sub(self.last) >= EXPIRY
     }
 
     /// Returns the remaining wait, given that `free` failures are allowed.
@@ -64,7 +64,7 @@ pub trait GuessSource: Eq + Hash + Clone {
     fn allowances(&self) -> Vec<(Self, u32)>;
 }
 
-/// By account name.
+/// Guesses for one account are grouped by its name.
 impl GuessSource for String {
     fn allowances(&self) -> Vec<(String, u32)> {
         vec![(self.clone(), FREE)]
@@ -129,7 +129,7 @@ impl<S: GuessSource> GuessLimiter<S> {
 
     /// Removes the entry whose last failure is oldest if the table is full.
     fn make_room(&mut self, newcomer: &S) {
-        if self.remembered.len() < REMEMBERED || self.remembered.contains_key(newcomer) {
+        if self.remembered.len() < MAX_ENTRIES || self.remembered.contains_key(newcomer) {
             return;
         }
         let oldest = self.remembered.iter().min_by_key(|(_, guessed)| guessed.last);
@@ -176,7 +176,7 @@ mod tests {
             now += wait;
         }
         assert_eq!(guesses.check(from, now), Ok(()));
-        assert_eq!(guesses.record_failure(from, now - 60_000 + FORGOTTEN), None);
+        assert_eq!(guesses.record_failure(from, now - 60_000 + EXPIRY), None);
         assert_eq!(guesses.counts(), (u64::from(FREE) + 9, 9));
     }
 
@@ -213,7 +213,7 @@ mod tests {
             }
             let most = if bits == 12 { FREE * WIDER } else { FREE * WIDER * WIDER };
             assert_eq!(looked_at, most, "{bits}");
-            assert!(guesses.remembered.len() < REMEMBERED);
+            assert!(guesses.remembered.len() < MAX_ENTRIES);
             for other in ["2001:db9::1", "192.0.2.1"] {
                 assert_eq!(guesses.check(address(other), 2), Ok(()), "{other}");
                 assert_eq!(guesses.record_failure(address(other), 2), None, "{other}");
@@ -225,21 +225,21 @@ mod tests {
     fn a_great_many_addresses_hold_up_nobody_and_the_longest_quiet_are_forgotten() {
         let mut guesses = GuessLimiter::<Host>::default();
         let many = |number: u32| IpAddr::V4((0x0b00_0000 + number).into());
-        for number in 0..REMEMBERED as u32 {
+        for number in 0..MAX_ENTRIES as u32 {
             guesses.record_failure(many(number), 1);
         }
         guess_freely(&mut guesses, "10.0.0.7", 2);
         guesses.record_failure(address("10.0.0.7"), 2);
-        for number in 0..REMEMBERED as u32 - 1 {
+        for number in 0..MAX_ENTRIES as u32 - 1 {
             guesses.record_failure(many(1 << 20 | number), 3);
         }
-        assert_eq!(guesses.remembered.len(), REMEMBERED);
+        assert_eq!(guesses.remembered.len(), MAX_ENTRIES);
         assert!(guesses.check(address("10.0.0.7"), 3).is_err(), "it has a place");
         // A new address is looked at immediately and slowed as soon as any other.
         assert_eq!(guesses.check(address("192.0.2.1"), 3), Ok(()));
         guess_freely(&mut guesses, "192.0.2.1", 3);
         assert!(guesses.record_failure(address("192.0.2.1"), 3).is_some());
-        assert_eq!(guesses.remembered.len(), REMEMBERED);
+        assert_eq!(guesses.remembered.len(), MAX_ENTRIES);
     }
 
     proptest! {
@@ -257,7 +257,7 @@ mod tests {
             }
             // 1 + 2 + … + 32 s, then 60 s each; the span is too short for failures to expire.
             let slow = now / LONGEST + 7;
-            prop_assert!(looked_at <= u64::from(FREE) + slow || now >= FORGOTTEN, "{} in {} ms", looked_at, now);
+            prop_assert!(looked_at <= u64::from(FREE) + slow || now >= EXPIRY, "{} in {} ms", looked_at, now);
             let (unknown, slowed) = guesses.counts();
             prop_assert_eq!((unknown, unknown + slowed), (looked_at, steps.len() as u64));
         }

@@ -153,7 +153,7 @@ impl fmt::Display for Principal {
 }
 
 /// Name prefix of people known to the identity provider; accounts and tokens cannot have such names.
-pub const PROVIDED: &str = "oidc:";
+pub const PROVIDER_PREFIX: &str = "oidc:";
 
 /// Maximum length of such a name without the prefix.
 const LONGEST_PROVIDED: usize = 48;
@@ -164,18 +164,18 @@ pub fn oidc_principal_name(called: &str) -> String {
     let kept = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-' | '@' | '+');
     let plain = called.chars().map(|c| if kept(c) { c } else { '-' });
     let name: String = plain.take(LONGEST_PROVIDED).collect();
-    if name.is_empty() { format!("{PROVIDED}-") } else { format!("{PROVIDED}{name}") }
+    if name.is_empty() { format!("{PROVIDER_PREFIX}-") } else { format!("{PROVIDER_PREFIX}{name}") }
 }
 
 /// Checks that a name can belong to an account, a token or a person of the identity provider.
 pub(crate) fn check_any_name(name: &str) -> Result<(), Error> {
-    let Some(called) = name.strip_prefix(PROVIDED) else {
+    let Some(called) = name.strip_prefix(PROVIDER_PREFIX) else {
         return check_name(name);
     };
     // Of people with the same name, all but the first have a number.
     let (called, number) = called.split_once('~').unwrap_or((called, "2"));
     let numbered = number.bytes().all(|byte| byte.is_ascii_digit()) && !number.is_empty();
-    if numbered && !called.is_empty() && oidc_principal_name(called) == format!("{PROVIDED}{called}") {
+    if numbered && !called.is_empty() && oidc_principal_name(called) == format!("{PROVIDER_PREFIX}{called}") {
         Ok(())
     } else {
         Err(Error::Name(name.to_owned()))

@@ -61,7 +61,7 @@ pub enum RevisionPart {
     Sla,
     /// A grant beyond the container, such as a device.
     Grant,
-    /// How robots share servants.
+    /// Sharing of servants between robots.
     Shared,
     /// An environment variable; its value is not reported.
     Environment,

@@ -36,7 +36,7 @@ pub struct Goal {
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum GoalState {
-    /// Not finished yet.
+    /// The goal has not ended.
     Underway,
     /// Cancelled while it was being executed.
     Preempted,

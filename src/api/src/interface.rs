@@ -46,7 +46,7 @@ pub struct Request {
     pub input: String,
     /// Absolute names of the output topics; the response time is that of the first one.
     pub outputs: Vec<String>,
-    /// How an answer is matched: `stamp`, or `arrival` if the next message is the answer.
+    /// Rule that matches answers to requests: `stamp`, or `arrival` if the next message is the answer.
     pub by: String,
     /// How the pair was determined: `stated`, `watched` (observed at the push), `alone` (the node has no other topics)
     /// or `guessed`.

@@ -191,7 +191,7 @@ pub enum PushEvent {
     Underlay {
         /// The published underlay.
         underlay: Box<Underlay>,
-        /// Its layers.
+        /// Layers of the image.
         layers: Vec<Layer>,
         /// Duration of the push in milliseconds, from the first byte.
         took: u64,

@@ -51,7 +51,7 @@ pub struct ServiceDetail {
     pub nodes: Vec<Node>,
     /// Interface of the current revision.
     pub interface: Interface,
-    /// How robots share servants of the current revision; absent if each robot has a servant of its own.
+    /// Sharing of the current revision's servants; absent if each robot has a servant of its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<Shared>,
     /// Groups of shared servants, by revision.

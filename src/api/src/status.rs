@@ -11,6 +11,10 @@ use crate::limits::{Limits, Usage};
 pub struct Status {
     /// Version of the daemon.
     pub version: String,
+    /// Architecture of this machine, such as `x86_64` or `aarch64`; empty from earlier versions.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub architecture: String,
     /// Process id of the daemon.
     pub pid: u32,
     /// State directory.

@@ -14,10 +14,12 @@ use rcgen::{
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
 
-use crate::{CertificateRequest, Error, Millis, SCHEME, UnreadableCertificate, VerifiedCertificate, shown};
+use crate::{
+    CertificateRequest, Error, Millis, SCHEME, UnreadableCertificate, VerifiedCertificate, client_certificate,
+};
 
 /// Time by which a certificate's validity starts earlier, because clocks of other machines may be behind.
-const BEFORE: Duration = Duration::from_secs(300);
+const CLOCK_TOLERANCE: Duration = Duration::from_secs(300);
 
 /// Reason why a text (PEM) is no authority.
 #[derive(Debug, thiserror::Error)]
@@ -93,7 +95,7 @@ impl Authority {
     fn from_pem(text: &str) -> Result<Authority, AuthorityPemError> {
         let certificate = CertificateDer::from_pem_slice(text.as_bytes()).map_err(AuthorityPemError::Certificate)?;
         let key = KeyPair::from_pem(find_private_key(text)?)?;
-        let name = shown::subject_der(&certificate)?;
+        let name = client_certificate::subject_der(&certificate)?;
         let issuer = Issuer::from_ca_cert_der(&certificate, key)?;
         Ok(Authority { certificate, issuer, name })
     }
@@ -126,7 +128,7 @@ impl Authority {
         params.distinguished_name = rcgen::DistinguishedName::new();
         params.distinguished_name.push(DnType::CommonName, name.as_str());
         params.subject_alt_names = vec![SanType::URI(name.try_into().map_err(unmade)?)];
-        params.not_before = at(now_seconds.saturating_sub(BEFORE.as_secs()));
+        params.not_before = at(now_seconds.saturating_sub(CLOCK_TOLERANCE.as_secs()));
         // notAfter is inclusive.
         params.not_after = at(end_seconds - 1);
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
@@ -154,7 +156,7 @@ fn generate() -> Result<String, rcgen::Error> {
     let mut params = CertificateParams::default();
     let key = KeyPair::generate()?;
     // A unique name, so that certificates of another daemon are recognised before their signature is verified.
-    let id = hex::encode(&crate::shown::hash_key(rcgen::PublicKeyData::der_bytes(&key))[..8]);
+    let id = hex::encode(&crate::client_certificate::hash_key(rcgen::PublicKeyData::der_bytes(&key))[..8]);
     params.distinguished_name = rcgen::DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, format!("cloudroid robots {id}"));
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -214,11 +216,11 @@ mod tests {
         let issued = authority.issue(&request, "rover1", now, week).expect("made");
         assert_eq!((issued.issued, issued.expires), (1_800_000_000_000, 1_800_604_800_000));
         let der = CertificateDer::from_pem_slice(issued.certificate.as_bytes()).expect("PEM");
-        let shown = shown::read_robot_certificate(&der).expect("readable");
+        let shown = client_certificate::read_robot_certificate(&der).expect("readable");
         assert_eq!((&*shown.robot, &*shown.key, shown.until), ("rover1", request.key_hash(), issued.expires));
         assert!(authority.has_issued(&shown) && !other.has_issued(&shown));
         // The authority's own certificate names no robot.
-        let refused = shown::read_robot_certificate(authority.certificate()).expect_err("an authority");
+        let refused = client_certificate::read_robot_certificate(authority.certificate()).expect_err("an authority");
         assert!(refused.to_string().contains("robot:NAME"), "{refused}");
     }
 }

@@ -10,15 +10,17 @@
 
 #![forbid(unsafe_code)]
 
+mod client_certificate;
 mod issue;
 mod request;
-mod shown;
 
 use std::path::PathBuf;
 
+pub use client_certificate::{
+    UnreadableCertificate, ValidityPeriod, VerifiedCertificate, read_robot_certificate, read_validity,
+};
 pub use issue::{Authority, AuthorityPemError, IssuedRobotCertificate};
 pub use request::{CertificateRequest, LONGEST};
-pub use shown::{UnreadableCertificate, ValidityPeriod, VerifiedCertificate, read_robot_certificate, read_validity};
 
 /// Milliseconds since 1970.
 pub type Millis = u64;

@@ -11,7 +11,7 @@ use x509_parser::certification_request::X509CertificationRequest;
 use x509_parser::oid_registry::{OID_EC_P256, OID_KEY_TYPE_EC_PUBLIC_KEY, OID_SIG_ED25519};
 use x509_parser::prelude::FromDer;
 
-use crate::{Error, SCHEME, shown};
+use crate::{Error, SCHEME, client_certificate};
 
 /// Maximum size of a request in bytes; one with a P-256 key has about 500.
 pub const LONGEST: usize = 4096;
@@ -66,7 +66,7 @@ impl CertificateRequest {
         if !known {
             return Err(Error::Kind);
         }
-        Ok(CertificateRequest { hash: hex::encode(shown::hash_key(bytes)), key })
+        Ok(CertificateRequest { hash: hex::encode(client_certificate::hash_key(bytes)), key })
     }
 
     /// Returns the SHA-256 hash of the key in hexadecimal.

@@ -9,11 +9,11 @@ use budget::{Budget, Permit};
 use crate::outbox::ControlMessage;
 
 /// Maximum number of answers kept.
-const MAX_KEPT: usize = 1024;
+const MAX_ANSWERS: usize = 1024;
 /// Maximum bytes of those answers; the latest is always kept.
 const MAX_KEPT_BYTES: usize = 32 << 20;
 /// Bytes that are kept only until the next ping: beyond this it is sent at once.
-const ASKED_ABOUT: usize = 4 << 20;
+const PING_BYTES: usize = 4 << 20;
 /// Delay before an answer gets its own ping. Most are followed by another ping earlier.
 const PATIENCE: Duration = Duration::from_secs(1);
 
@@ -50,7 +50,7 @@ impl Acks {
         self.bytes += size;
         self.small += control.small_bytes();
         self.unasked += size;
-        while self.kept.len() >= MAX_KEPT || self.bytes > MAX_KEPT_BYTES || self.permit.count(self.small).is_err() {
+        while self.kept.len() >= MAX_ANSWERS || self.bytes > MAX_KEPT_BYTES || self.permit.count(self.small).is_err() {
             let Some(oldest) = self.kept.pop_front() else {
                 break;
             };
@@ -63,7 +63,7 @@ impl Acks {
     /// Returns when a ping should follow the answers sent.
     pub(crate) fn ping_due(&self) -> Option<Instant> {
         let unpinged = self.kept.partition_point(|sent| sent.ping <= self.pings);
-        let patience = if self.unasked > ASKED_ABOUT { Duration::ZERO } else { PATIENCE };
+        let patience = if self.unasked > PING_BYTES { Duration::ZERO } else { PATIENCE };
         self.kept.get(unpinged).map(|sent| sent.at + patience)
     }
 

@@ -49,7 +49,7 @@ fn remove_matching<T>(from: &mut HashMap<String, T>, chosen: impl Fn(&str) -> bo
 }
 
 /// Maximum length, in characters, of an unknown field's name in a status message.
-const SHOWN: usize = 48;
+const MAX_SHOWN_NAME: usize = 48;
 
 /// Reasons why an operation is refused, of which the client is told.
 #[derive(Debug, thiserror::Error)]
@@ -143,7 +143,7 @@ impl BridgeClient {
 
     /// Handles a binary frame.
     pub(crate) fn on_binary(self: &Arc<Self>, inbox: &mut Inbox, bytes: &Bytes) {
-        self.handle_frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
+        self.handle_frame(inbox, Incoming::from_binary(bytes), Some(bytes), 0);
     }
 
     fn handle_frame(self: &Arc<Self>, inbox: &mut Inbox, frame: Incoming<'_>, source: Option<&Bytes>, wrapping: usize) {
@@ -154,7 +154,7 @@ impl BridgeClient {
         };
         if self.wants_level(StatusLevel::Warning) {
             for field in rosbridge::unknown_fields(frame) {
-                let field: String = field.chars().take(SHOWN).collect();
+                let field: String = field.chars().take(MAX_SHOWN_NAME).collect();
                 let text = format!("{}: field {field:?} is not known and was ignored", op.name());
                 self.send_status(StatusLevel::Warning, op.id().cloned().map(Id::into_owned), format, &text);
             }

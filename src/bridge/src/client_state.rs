@@ -83,6 +83,8 @@ pub(crate) struct Untyped {
 pub(crate) struct ClientServices {
     pub(crate) served: HashMap<String, ServedService>,
     pub(crate) requests: HashMap<String, PendingCall>,
+    /// Number of calls that the client has been given, of all its services.
+    pub(crate) requested: u64,
 }
 
 /// A service of a client.
@@ -159,8 +161,9 @@ pub(crate) struct ActionClient {
 /// An action that a client serves.
 pub(crate) struct ActionServer {
     pub(crate) name: String,
-    /// Name as the client wrote it.
+    /// Name and type as the client wrote them.
     pub(crate) written: String,
+    pub(crate) written_type: String,
     pub(crate) def: Arc<ActionDef>,
     pub(crate) compression: Compression,
     /// Goals in progress: from the client's ids to the bus's.

@@ -19,7 +19,7 @@ use crate::SessionEnd;
 use crate::acks::Acks;
 use crate::client::{BridgeClient, Inbox};
 use crate::cut::Fragmenter;
-use crate::kept::EarlyMessages;
+use crate::early_messages::EarlyMessages;
 use crate::outbox::{CloseReason, ControlMessage};
 use ws::{WebSocket, WsError, WsMessage, frame};
 
@@ -31,7 +31,7 @@ const READ_BATCH: usize = 64;
 const ROUNDS: usize = 16;
 /// Bytes moved before yielding to other tasks. The work caused by a large message (a node's connection that writes it)
 /// often waits for this very thread; reading the next message first would stall both.
-const MOVED: usize = 128 * 1024;
+const TURN_BYTES: usize = 128 * 1024;
 /// Number of queued answers above which nothing more is read from the client.
 const CONTROL_HIGH: usize = 256;
 
@@ -112,7 +112,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     /// Reads frames from the client. Ready when a batch was handled, pending when none is available.
     fn read(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), StopReason>> {
         for _ in 0..READ_BATCH {
-            if self.moved >= MOVED {
+            if self.moved >= TURN_BYTES {
                 break;
             }
             // A client that does not read our answers has nothing more to say.
@@ -248,7 +248,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
                 written => written,
             };
             let more = read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
-            if self.moved >= MOVED {
+            if self.moved >= TURN_BYTES {
                 break;
             }
             if !more && self.poll_timer(cx, self.next_deadline()).is_pending() {

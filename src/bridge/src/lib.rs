@@ -29,14 +29,14 @@
 mod acks;
 mod bridge;
 mod client;
+mod client_grants;
 mod client_state;
 mod clock;
 mod connection;
-mod counted;
+mod counted_publisher;
 mod cut;
+mod early_messages;
 mod fanout;
-mod granted;
-mod kept;
 mod lacking;
 mod lease;
 mod metrics;
@@ -64,11 +64,11 @@ mod topics;
 mod waiting;
 
 /// Name of the node by which people inspect a servant. Messages of robots do not wait for it.
-pub const INSIDE: &str = "/cloudroid_inside";
+pub const INSIDE_NODE: &str = "/cloudroid_inside";
 
 pub use bridge::{Bridge, refuse};
-pub use granted::{ClientGrants, NotGrantedError};
-pub use metrics::{Counter, Drops, Metrics};
+pub use client_grants::{ClientGrants, NotGrantedError};
+pub use metrics::{Counter, Drops, Metrics, MetricsSnapshot};
 pub use options::{BridgeOptions, RequestObserver, SessionOptions};
 pub use session::{SessionCount, SessionEnd};
 pub use subscribers::{WaitDeadlines, find_missing_subscribers, wait_for_subscribers};

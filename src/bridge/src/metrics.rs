@@ -60,10 +60,25 @@ macro_rules! metrics {
             pub drops: Arc<Drops>,
         }
 
+        /// Values of [`Metrics`] at one time.
+        #[derive(Debug, Clone, Default, PartialEq, Eq)]
+        pub struct MetricsSnapshot {
+            $($(#[doc = $doc])* pub $field: u64,)*
+            /// Numbers of dropped messages by topic, in both directions.
+            pub drops: BTreeMap<String, u64>,
+        }
+
         impl Metrics {
+            /// Returns the present values.
+            pub fn snapshot(&self) -> MetricsSnapshot {
+                MetricsSnapshot { $($field: self.$field.get(),)* drops: self.drops.all() }
+            }
+        }
+
+        impl MetricsSnapshot {
             /// Returns every counter with its Prometheus name and help text.
             pub fn all(&self) -> Vec<(&'static str, &'static str, u64)> {
-                vec![$(($name, concat!($($doc,)*).trim_ascii(), self.$field.get()),)*]
+                vec![$(($name, concat!($($doc,)*).trim_ascii(), self.$field),)*]
             }
         }
     };
@@ -126,6 +141,13 @@ impl Metrics {
     }
 }
 
+impl MetricsSnapshot {
+    /// Returns the number of messages dropped because a client or the bridge was slow.
+    pub fn dropped_count(&self) -> u64 {
+        self.dropped + self.bus_dropped
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -149,7 +171,10 @@ mod tests {
     fn every_counter_is_told_by_its_name_with_what_it_counts() {
         let metrics = Metrics::default();
         metrics.dropped.add(3);
-        let all = metrics.all();
+        metrics.drops.add("/a", 2);
+        let snapshot = metrics.snapshot();
+        assert_eq!(snapshot.drops, BTreeMap::from([("/a".to_owned(), 2)]));
+        let all = snapshot.all();
         let help = "Messages dropped because a client read too slowly.";
         assert!(all.contains(&("cloudroid_bridge_dropped_total", help, 3)));
         assert!(all.iter().all(|(name, ..)| name.ends_with("_total")));

@@ -124,11 +124,11 @@ pub(crate) fn digest_word(version: RosVersion) -> &'static str {
 mod tests {
     use super::*;
 
-    const BOTH: [RosVersion; 2] = [RosVersion::One, RosVersion::Two];
+    const BOTH_VERSIONS: [RosVersion; 2] = [RosVersion::One, RosVersion::Two];
 
     #[test]
     fn names_become_absolute() {
-        for version in BOTH {
+        for version in BOTH_VERSIONS {
             assert!(matches!(resolve(version, "/camera/image_raw"), Ok(Cow::Borrowed("/camera/image_raw"))));
             assert_eq!(resolve(version, "chatter").unwrap(), "/chatter");
             assert_eq!(resolve(version, "//a///b/").unwrap(), "/a/b");
@@ -168,11 +168,11 @@ mod tests {
 
     #[test]
     fn whoever_takes_any_definition_takes_those_of_its_ros() {
-        for version in BOTH {
+        for version in BOTH_VERSIONS {
             let any = wildcard_type(version, "*");
             let own = WireType { format: WireFormat::for_version(version), ..WireType::new("a/B", "1234", "") };
             assert!(any.is_compatible_with(&own));
-            for other in BOTH {
+            for other in BOTH_VERSIONS {
                 assert_eq!(wildcard_type(other, "a/B").is_compatible_with(&own), other == version);
             }
         }

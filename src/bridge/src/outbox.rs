@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use budget::{Budget, Exceeded, Permit};
 use parking_lot::Mutex;
-use ros::ring::{Ring, RingBounds, RingItem};
+use ros::ring::{DropTally, Ring, RingBounds, RingItem};
 use rosbridge::Compression;
 use tokio::sync::watch;
 
@@ -200,10 +200,7 @@ impl Outbox {
         while let Some(one) = queues.topics.drop_over_limit(self.limits.session_bytes) {
             lost += one;
         }
-        while queues.count_bytes().is_err() {
-            let Some(one) = queues.topics.drop_largest(|_| true) else {
-                break;
-            };
+        while let Some(one) = queues.drop_over_budget() {
             lost += one;
         }
         self.metrics.record_lost(lost);
@@ -283,7 +280,7 @@ impl RingItem for ControlMessage {
 impl OutboxQueues {
     fn new(budget: &Budget) -> Self {
         Self {
-            control: Ring::new_unbounded(),
+            control: Ring::default(),
             control_small: 0,
             topics: TopicQueues::default(),
             small: budget.permit(),
@@ -299,6 +296,17 @@ impl OutboxQueues {
         let load = self.topics.load();
         self.big.count(load.big)?;
         self.small.count(self.control_small + load.bytes - load.big)
+    }
+
+    /// Drops a message if the queues do not fit into the client's budget, or, where more than one of a topic waits,
+    /// leave less than an eighth of it for what the client sends.
+    fn drop_over_budget(&mut self) -> Option<DropTally> {
+        if self.count_bytes().is_err() {
+            return self.topics.drop_largest(|_| true);
+        }
+        let budget = self.big.budget();
+        let is_crowded = budget.used_bytes() > budget.limit() - budget.limit() / 8;
+        is_crowded.then(|| self.topics.drop_largest(|queue| !queue.has_at_most_one())).flatten()
     }
 
     /// Counts the queues after a control message was added; since these cannot be dropped, the session ends if there is

@@ -135,6 +135,24 @@ fn ten_large_pictures_fit_into_one_clients_memory() {
 }
 
 #[test]
+fn unread_messages_leave_room_for_what_their_client_sends() {
+    let budget = Budget::new("client x", 4 << 20);
+    let open = |_| Outbox::new(&BridgeOptions::default(), Arc::default(), &budget);
+    let readers: Vec<Outbox> = (0..4).map(open).collect();
+    let keys: Vec<TopicKey> = readers.iter().map(|reader| reader.add_topic("/a".into(), wishes())).collect();
+    for _ in 0..50 {
+        for (reader, key) in readers.iter().zip(&keys) {
+            reader.push_sample(*key, sample(60_000), false);
+        }
+    }
+    assert!(budget.used_bytes() > 3 << 20, "{budget:?}");
+    assert!(budget.take(400_000).is_ok(), "{budget:?}");
+    for reader in &readers {
+        assert!(!drain(reader, Instant::now()).is_empty(), "the newest message is kept");
+    }
+}
+
+#[test]
 fn who_reads_no_answers_is_told_goodbye() {
     let (outbox, _) = outbox(BridgeOptions { control_messages: 2, ..BridgeOptions::default() });
     outbox.push_control(control(1));

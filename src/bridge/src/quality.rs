@@ -8,7 +8,7 @@ use rosbridge::{HistoryPolicy, Period, Subscribe};
 /// Default number of messages queued for a slow node.
 const DEFAULT_QUEUE: usize = 100;
 /// Maximum number of messages queued for a slow node.
-const MOST_QUEUED: usize = 1000;
+const MAX_QUEUE: usize = 1000;
 
 /// Quality of service offered by a client's publications.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -116,7 +116,7 @@ pub(crate) fn publication_offer(
     };
     let said = queue_size.filter(|size| *size > 0);
     let depth = match (qos.history, qos.depth) {
-        (Some(HistoryPolicy::KeepAll), _) => MOST_QUEUED,
+        (Some(HistoryPolicy::KeepAll), _) => MAX_QUEUE,
         (_, Some(depth)) => depth,
         // This many are sent to new subscribers: of latched messages the last one.
         (_, None) if latch && version == RosVersion::Two => 1,
@@ -130,7 +130,7 @@ pub(crate) fn publication_offer(
         Some(rosbridge::LivelinessPolicy::ManualByTopic) => QosLiveliness::ManualByTopic,
         _ => QosLiveliness::Automatic,
     };
-    let basic = QosProfile { reliability, ..QosProfile::keep_last(depth.min(MOST_QUEUED)).latching(latch) };
+    let basic = QosProfile { reliability, ..QosProfile::keep_last(depth.min(MAX_QUEUE)).latching(latch) };
     let qos = match version {
         RosVersion::One => basic,
         RosVersion::Two => QosProfile {
@@ -216,7 +216,7 @@ mod tests {
         assert_eq!(of(None, false, None), (new, DEFAULT_QUEUE, false));
         assert_eq!(of(None, true, Some(0)), (old, DEFAULT_QUEUE, true));
         assert_eq!(of(None, true, Some(7)), (old, 7, true));
-        assert_eq!(of(None, false, Some(u64::MAX)), (new, MOST_QUEUED, false));
+        assert_eq!(of(None, false, Some(u64::MAX)), (new, MAX_QUEUE, false));
         let kept = rosbridge::QosRequest {
             durability: Some(rosbridge::DurabilityPolicy::TransientLocal),
             depth: Some(1),
@@ -228,7 +228,7 @@ mod tests {
             durability: Some(rosbridge::DurabilityPolicy::Volatile),
             ..kept
         };
-        assert_eq!(of(some_qos(fleeting), true, None), (new, MOST_QUEUED, false));
+        assert_eq!(of(some_qos(fleeting), true, None), (new, MAX_QUEUE, false));
         let best = rosbridge::QosRequest { durability: Some(rosbridge::DurabilityPolicy::BestAvailable), ..kept };
         assert_eq!(of(some_qos(best), true, None), (old, 1, true));
         // In ROS 2 new subscribers receive as many messages as are kept.

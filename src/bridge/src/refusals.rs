@@ -4,7 +4,7 @@
 use ros::bus::{MatchedPeers, PeerId};
 
 /// Maximum number of endpoints reported.
-const MOST: usize = 64;
+const MAX_ENDPOINTS: usize = 64;
 
 /// Incompatible endpoints of one topic.
 #[derive(Debug, Default)]
@@ -22,7 +22,7 @@ impl Refusals {
         let mut new = Vec::new();
         for refusal in refused {
             let is_known = self.known.iter().any(|(peer, _)| *peer == refusal.peer);
-            if is_known || self.known.len() >= MOST {
+            if is_known || self.known.len() >= MAX_ENDPOINTS {
                 continue;
             }
             let told = format!("no messages pass between {} and this client: {}", refusal.peer, refusal.why);
@@ -72,7 +72,7 @@ mod tests {
     fn ends_without_number_are_not_told_without_number() {
         let many: Vec<_> = (0..1000).map(|number| ("/hostile", number)).collect();
         let mut refusals = Refusals::default();
-        assert_eq!(refusals.update(&refused_by(&many)).len(), MOST);
+        assert_eq!(refusals.update(&refused_by(&many)).len(), MAX_ENDPOINTS);
         assert_eq!(refusals.update(&refused_by(&many)).len(), 0);
     }
 }

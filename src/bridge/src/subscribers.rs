@@ -8,7 +8,7 @@ use ros::bus::{Bus, MatchedPeers};
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
-use crate::INSIDE;
+use crate::INSIDE_NODE;
 
 /// Factor of the waiting time for a registered node while nobody else is connected: on a busy machine rospy takes
 /// seconds.
@@ -44,7 +44,7 @@ pub fn find_missing_subscribers(bus: &dyn Bus, topic: &str, matched: &MatchedPee
     nodes
         .subscribers
         .iter()
-        .filter(|name| *name != bus.node() && *name != INSIDE)
+        .filter(|name| *name != bus.node() && *name != INSIDE_NODE)
         .filter(|name| !matched.has_node(name) && !is_refused(matched, name))
         .map(|name| {
             let address = graph.nodes.get(name).cloned();
@@ -70,7 +70,7 @@ pub async fn wait_for_subscribers(
     let mut in_time = wait_connected(subscribers, deadlines.some, &missing).await;
     let is_slow = {
         let matched = subscribers.borrow();
-        matched.connected_count_except(INSIDE) == 0 && !missing(&matched).is_empty()
+        matched.connected_count_except(INSIDE_NODE) == 0 && !missing(&matched).is_empty()
     };
     if !in_time && is_slow {
         in_time = wait_connected(subscribers, deadlines.none, &missing).await;
@@ -87,7 +87,7 @@ async fn wait_connected(
     let connected = async {
         loop {
             let matched = subscribers.borrow_and_update().clone();
-            if matched.connected_count_except(INSIDE) > 0 && missing(&matched).is_empty() {
+            if matched.connected_count_except(INSIDE_NODE) > 0 && missing(&matched).is_empty() {
                 return;
             }
             if subscribers.changed().await.is_err() {

@@ -33,7 +33,7 @@ const DEFINITIONS: &[(&str, &str)] = &[
 ];
 
 /// Fields of requests by callers and goals.
-const WANTED: &str = "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\n\
+const REQUEST_FIELDS: &str = "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\n\
                       float32 rate\n";
 const TRANSFORMS: &str = "geometry_msgs/TransformStamped[] transforms\n";
 
@@ -70,8 +70,11 @@ fn own_definitions(version: RosVersion) -> [(String, String); 3] {
     };
     [
         (format!("{package}/msg/TFArray"), TRANSFORMS.to_owned()),
-        (format!("{package}/srv/RepublishTFs"), format!("{WANTED}{duration} timeout\n---\nstring topic_name\n")),
-        (format!("{package}/action/TFSubscription"), format!("{WANTED}---\n---\n{TRANSFORMS}")),
+        (
+            format!("{package}/srv/RepublishTFs"),
+            format!("{REQUEST_FIELDS}{duration} timeout\n---\nstring topic_name\n"),
+        ),
+        (format!("{package}/action/TFSubscription"), format!("{REQUEST_FIELDS}---\n---\n{TRANSFORMS}")),
     ]
 }
 

@@ -12,7 +12,7 @@ use ros::schema::MessageType;
 use ros::sizes::SizeCounters;
 use tokio::sync::watch;
 
-use crate::counted::CountingPublisher;
+use crate::counted_publisher::CountingPublisher;
 use crate::quality::PublisherOffer;
 use crate::refusals::Refusals;
 use crate::shared::BridgeShared;

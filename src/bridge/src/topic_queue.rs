@@ -13,7 +13,7 @@ use crate::Drops;
 use crate::sample::TopicSample;
 
 /// Maximum number of latching publishers remembered.
-const MAX_MET: usize = 1024;
+const MAX_LATCHING_PUBLISHERS: usize = 1024;
 /// Maximum number of messages kept however large they are, if a client asked for them: the default of ROS's own queues.
 const MOST_LARGE: usize = 10;
 /// Default for a client that did not ask: a message that is read while another waits costs nothing, and no client gets
@@ -50,7 +50,7 @@ pub(crate) type Subscriptions = HashMap<Option<Id<'static>>, SubscriptionOptions
 
 struct QueuedSample {
     sample: Arc<TopicSample>,
-    /// Not delayed by a throttle rate: the last message of a latching publisher, for a new subscriber.
+    /// True for messages that no throttle rate delays: the last one of a latching publisher, for a new subscriber.
     first: bool,
 }
 
@@ -102,7 +102,7 @@ impl TopicQueue {
             drops,
             wishes,
             limits,
-            samples: Ring::new_unbounded(),
+            samples: Ring::default(),
             met: HashSet::new(),
             big: 0,
             next_at: None,
@@ -151,7 +151,7 @@ impl TopicQueue {
             return replay;
         }
         // An endless number of publisher names must not fill the memory.
-        if self.met.len() >= MAX_MET {
+        if self.met.len() >= MAX_LATCHING_PUBLISHERS {
             self.met.clear();
         }
         self.met.insert(sample.publisher.clone()) || replay

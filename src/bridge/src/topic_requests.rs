@@ -12,7 +12,7 @@ use ros::schema::MessageType;
 /// Maximum number of inputs awaiting an answer; beyond it the oldest are dropped.
 const OPEN: usize = 256;
 /// Time after which an output no longer answers an input.
-const FORGOTTEN: Duration = Duration::from_secs(60);
+const INPUT_EXPIRY: Duration = Duration::from_secs(60);
 
 /// Requests of one pair, over all clients of a bridge.
 pub(crate) struct TopicRequests {
@@ -66,7 +66,7 @@ impl TopicRequests {
             let first = open.pop_front();
             unanswered += usize::from(first.is_some_and(|it| it.heard && heard && !it.left_out));
         };
-        while open.front().is_some_and(|first| now.saturating_duration_since(first.since) >= FORGOTTEN) {
+        while open.front().is_some_and(|first| now.saturating_duration_since(first.since) >= INPUT_EXPIRY) {
             forget(&mut open);
         }
         if open.iter().all(|one| one.stamp != stamp) {
@@ -91,7 +91,7 @@ impl TopicRequests {
         let at = open.iter().position(|one| one.stamp == stamp)?;
         let took = now.saturating_duration_since(open.remove(at)?.since);
         open.iter_mut().take(at).for_each(|one| one.left_out = true);
-        (took < FORGOTTEN).then_some(took)
+        (took < INPUT_EXPIRY).then_some(took)
     }
 }
 
@@ -164,8 +164,8 @@ mod tests {
         assert_eq!(requests.record_answer(&of, b"", began + SECOND * 2), None);
         // A request that is never answered does not block others forever.
         requests.record_request(&of, b"", began, true);
-        requests.record_request(&of, b"", began + FORGOTTEN, true);
-        assert_eq!(requests.record_answer(&of, b"", began + FORGOTTEN + SECOND), Some(SECOND));
+        requests.record_request(&of, b"", began + INPUT_EXPIRY, true);
+        assert_eq!(requests.record_answer(&of, b"", began + INPUT_EXPIRY + SECOND), Some(SECOND));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Sleep, timeout};
 use ws::{WebSocket, WsError, WsMessage, frame};
 
-use crate::kept::{EarlyMessageOutcome, EarlyMessages};
+use crate::early_messages::{EarlyMessageOutcome, EarlyMessages};
 use crate::{BridgeOptions, SessionEnd};
 
 /// Number of messages read before yielding to other tasks.

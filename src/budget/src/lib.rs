@@ -9,11 +9,14 @@
 //! A permit counts in its budget and in all of that budget's ancestors. If one of them has no room, the permit is
 //! refused, and the error names the budget that is full. The caller decides what a refusal leads to; other permits are
 //! not affected.
+//!
+//! A budget may also limit the processor time of tasks that work for its owner ([`Budget::meter`]).
 
 #![forbid(unsafe_code)]
 
 mod json;
 mod shares;
+mod work;
 
 use std::fmt;
 use std::sync::Arc;
@@ -25,6 +28,8 @@ use tokio::sync::Notify;
 
 pub use json::JsonWeight;
 pub use shares::Shares;
+use work::WorkAccount;
+pub use work::{MeteredTask, WorkLimit};
 
 /// Size in bytes up to which a single message, body or queue is not counted in any budget: the number of connections
 /// limits their sum.
@@ -46,6 +51,8 @@ struct BudgetNode {
     /// Notified when bytes are released, here or in a descendant.
     released: Notify,
     above: Option<Budget>,
+    /// Processor time of its tasks, if that is limited.
+    work: Option<WorkAccount>,
     /// Called for refusals, here and in descendants.
     observer: Option<Observer>,
 }
@@ -70,17 +77,22 @@ pub struct Exceeded {
 impl Budget {
     /// Creates a root budget of `limit` bytes; error messages call it `name`.
     pub fn new(name: impl Into<String>, limit: usize) -> Self {
-        Self::from_parts(name.into(), limit, None, None)
+        Self::from_parts(name.into(), limit, None, None, None)
     }
 
     /// Creates a root budget whose `observer` is called for each refusal, in it and in its descendants.
     pub fn with_observer(name: impl Into<String>, limit: usize, observer: Observer) -> Self {
-        Self::from_parts(name.into(), limit, None, Some(observer))
+        Self::from_parts(name.into(), limit, None, Some(observer), None)
     }
 
     /// Creates a budget of `limit` bytes below this one: its permits count in both.
     pub fn child(&self, name: impl Into<String>, limit: usize) -> Self {
-        Self::from_parts(name.into(), limit, Some(self.clone()), None)
+        Self::from_parts(name.into(), limit, Some(self.clone()), None, None)
+    }
+
+    /// Creates a budget like [`child`](Self::child) that also limits the processor time of its tasks.
+    pub fn child_with_work(&self, name: impl Into<String>, limit: usize, work: WorkLimit) -> Self {
+        Self::from_parts(name.into(), limit, Some(self.clone()), None, Some(work))
     }
 
     /// Creates a budget that never refuses.
@@ -88,7 +100,13 @@ impl Budget {
         Self::new("everything", usize::MAX)
     }
 
-    fn from_parts(name: String, limit: usize, above: Option<Budget>, observer: Option<Observer>) -> Self {
+    fn from_parts(
+        name: String,
+        limit: usize,
+        above: Option<Budget>,
+        observer: Option<Observer>,
+        work: Option<WorkLimit>,
+    ) -> Self {
         Self::from(Arc::new(BudgetNode {
             name,
             limit,
@@ -96,6 +114,7 @@ impl Budget {
             refused: AtomicU64::new(0),
             released: Notify::new(),
             above,
+            work: work.map(WorkAccount::new),
             observer,
         }))
     }
@@ -161,6 +180,24 @@ impl Budget {
         let mut permit = self.permit();
         permit.wait(bytes, patience).await?;
         Ok(permit)
+    }
+
+    /// Returns the task as one whose processor time is charged to the nearest budget above, or this one, that limits
+    /// it. While that has used up its share, the task waits.
+    pub fn meter<F: Future>(&self, task: F) -> MeteredTask<F> {
+        MeteredTask::new(task, self)
+    }
+
+    /// Returns the processor time that was charged for tasks of this budget, or of the nearest one above that limits
+    /// it.
+    pub fn work_time(&self) -> Duration {
+        let account = self.find_payer().and_then(|payer| payer.work.as_ref());
+        account.map_or(Duration::ZERO, WorkAccount::total)
+    }
+
+    fn find_payer(&self) -> Option<&Arc<BudgetNode>> {
+        let mut all = std::iter::successors(Some(self), |budget| budget.node.above.as_ref());
+        all.find(|budget| budget.node.work.is_some()).map(|budget| &budget.node)
     }
 
     /// Returns the parent, if permits of this handle count there.
@@ -242,6 +279,11 @@ impl Permit {
     /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
         self.bytes
+    }
+
+    /// Returns the budget in which it counts.
+    pub fn budget(&self) -> &Budget {
+        &self.budget
     }
 
     /// Changes the size to `bytes`.

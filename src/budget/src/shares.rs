@@ -5,7 +5,7 @@ use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 
-use crate::{Budget, BudgetNode};
+use crate::{Budget, BudgetNode, WorkLimit};
 
 /// One budget per name, all of the same size, below a common parent. A name's budget exists for as long as there is a
 /// handle to it or a permit of it.
@@ -14,13 +14,19 @@ pub struct Shares {
     whole: Budget,
     what: &'static str,
     each: usize,
+    work: Option<WorkLimit>,
     known: Mutex<HashMap<String, Weak<BudgetNode>>>,
 }
 
 impl Shares {
     /// Creates a set of budgets of `each` bytes below `whole`; their names start with `what` (such as "client").
     pub fn new(whole: &Budget, what: &'static str, each: usize) -> Self {
-        Self { whole: whole.clone(), what, each, known: Mutex::default() }
+        Self { whole: whole.clone(), what, each, work: None, known: Mutex::default() }
+    }
+
+    /// Limits the processor time of each name's tasks too.
+    pub fn with_work(self, work: WorkLimit) -> Self {
+        Self { work: Some(work), ..self }
     }
 
     /// Returns the budget for `name`, creating it if necessary.
@@ -30,7 +36,11 @@ impl Shares {
             return Budget::from(node);
         }
         known.retain(|_, node| node.strong_count() > 0);
-        let budget = self.whole.child(format!("{} {name}", self.what), self.each);
+        let full_name = format!("{} {name}", self.what);
+        let budget = match self.work {
+            Some(work) => self.whole.child_with_work(full_name, self.each, work),
+            None => self.whole.child(full_name, self.each),
+        };
         known.insert(name.to_owned(), Arc::downgrade(&budget.node));
         budget
     }

@@ -6,7 +6,7 @@ use package::difference::{Change, Difference};
 use store::{RevisionRecord, State};
 
 /// Maximum number of differences named in an error.
-const NAMED: usize = 8;
+const MAX_NAMED_DIFFERENCES: usize = 8;
 
 /// Reason why a stub cannot be used with a service.
 #[derive(Debug, thiserror::Error)]
@@ -34,9 +34,9 @@ pub enum StubError {
 
 fn join_changes(changes: &[Change]) -> String {
     let mut words: Vec<String> = changes.iter().map(ToString::to_string).collect();
-    if words.len() > NAMED {
-        let more = words.len() - NAMED;
-        words.truncate(NAMED);
+    if words.len() > MAX_NAMED_DIFFERENCES {
+        let more = words.len() - MAX_NAMED_DIFFERENCES;
+        words.truncate(MAX_NAMED_DIFFERENCES);
         words.push(format!("{more} more"));
     }
     words.join("; ")

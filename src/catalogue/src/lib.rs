@@ -10,11 +10,11 @@
 
 #![forbid(unsafe_code)]
 
+mod disk_usage;
 mod error;
 mod fit;
 mod inventory;
 pub mod names;
-mod owned;
 mod publish;
 pub mod stubs;
 mod twins;

@@ -2,7 +2,7 @@
 //! names) and of robots.
 
 /// First path segments reserved by the portal.
-pub const RESERVED: [&str; 7] = ["api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove"];
+pub const RESERVED_NAMES: [&str; 7] = ["api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove"];
 
 /// An invalid name.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
@@ -33,7 +33,7 @@ pub fn validate_service(name: &str) -> Result<(), NameError> {
     if !well_formed {
         return Err(NameError::Service(name.to_owned()));
     }
-    if RESERVED.contains(&name) {
+    if RESERVED_NAMES.contains(&name) {
         return Err(NameError::Reserved(name.to_owned()));
     }
     Ok(())
@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn the_portals_own_paths_are_reserved() {
-        for name in RESERVED {
+        for name in RESERVED_NAMES {
             assert_eq!(validate_service(name), Err(NameError::Reserved(name.to_owned())));
         }
     }

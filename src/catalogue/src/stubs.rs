@@ -91,7 +91,7 @@ pub struct TargetRobots<'a> {
     pub ros: RosVersion,
     /// Program for the architecture of the robots.
     pub program: &'a StubProgram,
-    /// Where the robots reach the portal.
+    /// Address at which robots reach the portal.
     pub portal: &'a Portal,
     /// Rules by which types have counterparts in the robots' ROS.
     pub rules: &'a Arc<TranslationRules>,

@@ -1,4 +1,4 @@
-//! Whether a push changes anything: its revision is compared with the one that serves.
+//! Detection of pushes that change nothing: their revision is compared with the one that serves.
 
 use std::sync::Arc;
 

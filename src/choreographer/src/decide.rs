@@ -50,6 +50,7 @@ pub(crate) mod measured;
 pub(crate) mod nodes;
 pub(crate) mod placement;
 pub(crate) mod quota;
+pub(crate) mod refusal_reports;
 pub(crate) mod requests;
 pub(crate) mod rollout;
 pub(crate) mod shadow;
@@ -57,7 +58,6 @@ mod shares;
 mod sketch;
 pub(crate) mod stall;
 pub(crate) mod terms;
-pub(crate) mod told;
 pub(crate) mod warm_pool;
 
 #[cfg(test)]

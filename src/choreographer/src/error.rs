@@ -24,7 +24,7 @@ pub enum ResizeError {
         /// Memory limit that it would get.
         wanted: Size,
     },
-    /// Too many clients of the robot have stated something.
+    /// Too many clients of the robot have stated requirements.
     #[error("{STATING} nodes of its robot already have requests")]
     Many,
 }

@@ -37,13 +37,13 @@
 #![forbid(unsafe_code)]
 
 mod decide;
+mod description;
 mod error;
 pub mod limits;
 mod lives;
 mod memory;
 mod options;
 mod request;
-mod shown;
 mod tracer;
 
 use std::sync::Arc;
@@ -65,6 +65,7 @@ pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, RowError, check as check_row};
 pub use decide::quota::{Quota, QuotaFile, find_files_to_evict};
 pub use decide::terms::{Cap, CapSource, TermsError};
+pub use description::usage;
 pub use error::{Error, ResizeError, with_last_log_line};
 pub use lives::Choreographer;
 pub use lives::adoption::AdoptionResult;
@@ -78,7 +79,6 @@ pub use lives::waiting::{Admission, Permit, QueueStanding};
 pub use memory::{Memory, MemoryOptions};
 pub use options::{ClassOptions, DEFAULT_CLASS, HungPolicy, KeptLogOptions, Options};
 pub use request::ServantRequest;
-pub use shown::usage;
 pub use tracer::{RequestTracer, TracedServant};
 
 use decide::admission::AdmissionRequest;
@@ -94,9 +94,9 @@ use lives::lease::NewStatement;
 use lives::warm_pool::{self, WarmPool};
 
 /// Timeout for one answer in a trial: a recorded message without an answer must not delay the rest.
-const TRIED: Duration = Duration::from_secs(2);
+const TRIAL_ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Number of requests with which a picture is tried.
-const SHOWN: usize = 20;
+const TRIAL_PICTURES: usize = 20;
 
 impl Choreographer {
     /// Creates a choreographer that starts servants by `engine` and reaches them by `opener`.
@@ -398,10 +398,10 @@ impl Choreographer {
         measured.lease.wait_admitted().await?;
         let reach = measured.lease.wait_ready().await?;
         let interface = &measured.lease.handle().revision.interface;
-        let mut pace = ReplayPace::once(TRIED);
+        let mut pace = ReplayPace::once(TRIAL_ANSWER_TIMEOUT);
         if let Material::Pictures(_) = material {
             pace.again = true;
-            pace.requests = SHOWN;
+            pace.requests = TRIAL_PICTURES;
         }
         let replay = reach.replay(service, interface, &material, &pace).await?;
         Ok(replay.into_trial(service))

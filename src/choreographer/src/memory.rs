@@ -9,10 +9,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use budget::{Budget, Exceeded, Shares};
+use budget::{Budget, Exceeded, Shares, WorkLimit};
 use parking_lot::Mutex;
 
 use store::{Journal, NewEvent, NoticeThrottle};
+
+/// Processor time that one servant may make the daemon spend on following its graph and answering its nodes: starting
+/// nodes fit into the burst, and nodes that register and look without end are followed more slowly.
+const SERVANT_WORK: WorkLimit = WorkLimit { cores: 0.2, burst: Duration::from_secs(5) };
 
 /// Limits on memory outside of servants' containers.
 #[derive(Debug, Clone)]
@@ -56,7 +60,7 @@ impl Memory {
         let whole = Budget::with_observer("the daemon", bytes(options.daemon), Box::new(observer));
         Memory {
             clients: Shares::new(&whole, "client", bytes(options.client)),
-            servants: Shares::new(&whole, "servant", bytes(options.servant)),
+            servants: Shares::new(&whole, "servant", bytes(options.servant)).with_work(SERVANT_WORK),
             whole,
             refused,
             unfinished: options.unfinished,

@@ -1,4 +1,4 @@
-//! What makes traces of robots' requests, if the daemon has any.
+//! Interface to the tracer of robots' requests, if the daemon has one.
 
 use std::fmt;
 

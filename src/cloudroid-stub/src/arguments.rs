@@ -90,7 +90,7 @@ pub struct StubDoctorArgs {
 /// Groups of checks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum DoctorPart {
-    /// ROS version of this robot.
+    /// ROS version and middleware of this robot.
     Ros,
     /// Address, token, service, clock and MTU.
     Server,

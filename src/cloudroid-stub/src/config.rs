@@ -88,7 +88,7 @@ pub use sources::load;
 pub const FILE: &str = "stub.toml";
 
 /// Upper limit of the times, rates and counts in a configuration.
-const MOST: f64 = 1e6;
+const MAX_NUMBER: f64 = 1e6;
 
 /// Settings of the stub.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -200,7 +200,7 @@ pub struct Config {
 pub const FALLBACK_AFTER: f64 = 3.0;
 
 /// Advice for a robot without trusted authorities.
-const NOBODY_TRUSTED: &str = "no certificate authorities are installed on this robot: sudo apt install \
+const AUTHORITY_ADVICE: &str = "no certificate authorities are installed on this robot: sudo apt install \
     ca-certificates, or set ca_file in stub.toml to the server's authority";
 
 fn fallback_after() -> f64 {
@@ -265,7 +265,7 @@ impl Config {
             fingerprint: self.fingerprint,
             known: named.or(beside).map(KnownServers::new).or_else(KnownServers::for_user),
             accept: "install.sh --fingerprint".to_owned(),
-            advice: NOBODY_TRUSTED,
+            advice: AUTHORITY_ADVICE,
             identity: pairing::load_identity(self)?,
         })
     }
@@ -339,9 +339,9 @@ pub enum CodecSetting {
     /// Lossless, if it saves time.
     #[default]
     Auto,
-    /// If it saves time; images may lose detail, as JPEG.
+    /// JPEG where that saves time; images may lose detail.
     Jpeg,
-    /// If it saves time; images may lose detail, as H.264.
+    /// H.264 where that saves time; images may lose detail.
     Video,
 }
 

@@ -21,7 +21,7 @@ const TCP: Duration = Duration::from_secs(2);
 /// Largest response to the WebSocket handshake, in bytes.
 const MAX_HEAD: usize = 64 * 1024;
 /// Time allowed for a frame of the server from its first byte to its last.
-const UNFINISHED: Duration = Duration::from_secs(300);
+const FRAME_TIMEOUT: Duration = Duration::from_secs(300);
 const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
 /// Unsent bytes that the kernel may hold: data in the kernel cannot be replaced by newer data, and a command has to
 /// wait for it. At 500 kbit/s this is a quarter of a second.
@@ -144,7 +144,7 @@ async fn handshake(
         )));
     }
     let socket = WebSocket::client(stream, &answer[end..], link::MAX_FRAME, link::MAX_RECORD, rand::random());
-    Ok(socket.with_budget(&run::FROM_SERVER, UNFINISHED))
+    Ok(socket.with_budget(&run::FROM_SERVER, FRAME_TIMEOUT))
 }
 
 /// Returns keepalive settings: while a servant is started no data arrives, and a lost network must still be noticed.

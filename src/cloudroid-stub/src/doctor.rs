@@ -1,6 +1,7 @@
 //! `cloudroid-stub doctor`: checks everything that a stub needs, and shows the commands that fix problems.
 
 mod check;
+mod middleware;
 mod overlay;
 mod ros_version;
 mod server;
@@ -9,6 +10,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use foreign::terminal;
+use ros::bus::RosVersion;
 
 use crate::arguments::{DoctorPart, StubDoctorArgs};
 use check::CheckVerdict;
@@ -23,7 +25,10 @@ pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
     let mut checks = Vec::new();
     if is_asked(DoctorPart::Ros) {
         let wanted = stub.revision().ros();
-        checks.push(ros_version::check(wanted, &config.service, &variable, Path::new(ros_version::INSTALLED)));
+        checks.push(ros_version::check(wanted, &config.service, &variable, Path::new(ros_version::UPSTREAM_SPACES)));
+        if wanted == RosVersion::Two {
+            checks.push(middleware::check(&variable));
+        }
     }
     if is_asked(DoctorPart::Server) {
         checks.extend(runtime.block_on(server::checks(&config, &stub)));

@@ -26,7 +26,7 @@ const SIGN: Duration = Duration::from_millis(1500);
 /// Pause between a response and the next ping.
 const PAUSE: Duration = Duration::from_millis(500);
 /// Time allowed for telling the cloud that the stub ends.
-const TOLD: Duration = Duration::from_millis(500);
+const FAREWELL_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Sends this signal to the real node and returns its exit, unless the cloud stops responding or `other` ends the wait.
 pub async fn stop_node(mirror: &Mirror, signal: i32, other: impl Future<Output = ()>) -> Option<Exit> {
@@ -61,7 +61,7 @@ pub async fn close_all(mirror: &Mirror, linked: impl FusedFuture, buses: &[Arc<d
     session.close(1000, "the robot's node ended");
     let told = async {
         if session.is_up() && !linked.is_terminated() {
-            let _ = timeout(TOLD, linked).await;
+            let _ = timeout(FAREWELL_TIMEOUT, linked).await;
         }
     };
     tokio::join!(told, close_buses(buses));

@@ -51,7 +51,7 @@ struct RetryPauses {
     away: Duration,
     /// Limit while the server reports that it has no capacity.
     busy: Duration,
-    /// Limit while the server refuses a stub whose link it had accepted before; applies from the first such attempt on.
+    /// Limit while the server refuses a stub whose link it had accepted before; the first interval is at least `busy`.
     refused: Duration,
     /// Age of a link after which it is retried at once when it is lost. A younger one may be accepted and lost
     /// repeatedly.
@@ -101,11 +101,9 @@ async fn run_link_with(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello,
             }
             Err(connect::Error::Refused(reason)) if link.session.is_none() => return reason,
             Err(connect::Error::Refused(reason)) => {
-                pace.pause = pauses.refused;
-                let again = format!(
-                    "the server accepted this node before, so the stub retries about every {:?}",
-                    pauses.refused
-                );
+                pace.on_refused(pauses);
+                let limit = pauses.refused;
+                let again = format!("the server accepted this node before, so the stub retries within {limit:?}");
                 Some((format!("{reason}; {again}"), pauses.refused))
             }
             Err(connect::Error::Unreachable(reason)) => Some((format!("{reason}; trying again"), pauses.away)),
@@ -144,6 +142,10 @@ impl RetryPace {
         if since.is_some_and(|since| since.elapsed() >= pauses.stood) {
             *self = Self::default();
         }
+    }
+
+    fn on_refused(&mut self, pauses: &RetryPauses) {
+        self.pause = self.pause.max(pauses.busy);
     }
 
     /// Waits until the next attempt, with jitter: otherwise all robots would connect at once when the server is back.
@@ -233,8 +235,7 @@ impl RobotLink<'_> {
                 tracing::info!(servant, resumed, "linked to {}", self.config.server);
                 let session = self.mirror.session();
                 if self.config.codec != config::CodecSetting::None {
-                    session.set_quality(self.config.quality());
-                    session.set_peer_codecs(&codecs);
+                    session.set_peer_codecs(&codecs, self.config.quality());
                 }
                 let unmet = self.config.codec.unsupported_reason(&codecs);
                 if let Some(unmet) = unmet.as_ref().filter(|_| unmet != self.unmet) {

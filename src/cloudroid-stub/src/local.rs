@@ -29,7 +29,7 @@ mod stamp;
 pub mod tests;
 
 pub use expected::ExpectedInterface;
-pub use keeper::{Application, Cloud, Keeper};
+pub use keeper::{Application, Cloud, Keeper, OutputTiming};
 pub use lender::{call_limit_for, describe_failure};
 pub use original::{Original, OriginalSetup, QUEUE};
 pub use pending_answer::PendingAnswer;

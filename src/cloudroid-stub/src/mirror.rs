@@ -14,8 +14,8 @@ mod calls;
 pub mod diagnostics;
 mod dropped;
 mod inputs;
-mod known;
-mod lent;
+mod known_interface;
+mod lent_services;
 mod outputs;
 mod parameters;
 pub mod promise;
@@ -36,10 +36,10 @@ use budget::Permit;
 use foreign::terminal;
 use link::control::{Exit, FromCloud, Graph};
 use link::drops::{Cause, DropCounters};
-use link::record::{ReceivedCall, Record};
+use link::record::Record;
 use link::{RobotSession, SessionHandler};
 use parking_lot::{Mutex, RwLock};
-use ros::bus::{Bus, NodeNames, ParamValue, WireType};
+use ros::bus::{Bus, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
 
 use crate::output;
@@ -76,7 +76,7 @@ impl Mirror {
             orders,
         });
         tokio::spawn(process_orders(Arc::downgrade(&mirror), taken));
-        tokio::spawn(lent::watch_graph(Arc::downgrade(&mirror)));
+        tokio::spawn(lent_services::watch_graph(Arc::downgrade(&mirror)));
         tokio::spawn(dropped::report_loop(Arc::downgrade(&mirror)));
         tokio::spawn(refusals::report_loop(Arc::downgrade(&mirror)));
         mirror
@@ -165,9 +165,7 @@ impl SessionHandler<FromCloud> for Mirror {
                 let way = (taken, given, arrived);
                 self.calls.on_answer(self, id, way, response);
             }
-            Record::Call { id, service, request } => {
-                self.lent.call(self, ReceivedCall { id, service, request, held, taken: arrived })
-            }
+            Record::Call(call) => self.lent.call(self, call, held, arrived),
             // An untrusted server could otherwise send control sequences to the robot's terminal.
             Record::Control(FromCloud::Line { error: true, text }) => {
                 output::STDERR.print(format!("{}\n", terminal::escape(&text, true)));
@@ -187,10 +185,9 @@ impl SessionHandler<FromCloud> for Mirror {
 
 impl AppliedGraph {
     fn set_graph(&mut self, graph: Graph) {
-        let told = graph.nodes.iter();
-        let told = told.map(|(node, has)| (node.clone(), NodeNames::from(has.clone())));
+        let told = graph.nodes.clone();
         if self.settled {
-            self.nodes = told.collect();
+            self.nodes = told;
         } else {
             // Names that are not listed yet stay registered, and so does their owner.
             for (node, names) in told {

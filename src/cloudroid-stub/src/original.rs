@@ -24,7 +24,8 @@ use crate::revision::Revision;
 /// Maximum depth of executables below `share/PKG` or a source directory.
 const DEPTH: usize = 4;
 /// Variables that list workspaces.
-const SEARCHED: [&str; 4] = ["CMAKE_PREFIX_PATH", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"];
+const WORKSPACE_VARIABLES: [&str; 4] =
+    ["CMAKE_PREFIX_PATH", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"];
 
 /// Replaces this process with the original, in the environment that it would have had.
 pub fn exec(node: &NodeArgs, argv: &[String]) -> anyhow::Result<ExitCode> {
@@ -48,7 +49,10 @@ pub fn overlay(share: &Path) -> PathBuf {
 /// Returns the variables that list workspaces, without this stub's overlay, so that programs started by the original
 /// find originals, too.
 pub fn environment(overlay: &Path) -> Vec<(&'static str, OsString)> {
-    SEARCHED.into_iter().filter_map(|name| Some((name, without_overlay(&std::env::var_os(name)?, overlay)?))).collect()
+    WORKSPACE_VARIABLES
+        .into_iter()
+        .filter_map(|name| Some((name, without_overlay(&std::env::var_os(name)?, overlay)?)))
+        .collect()
 }
 
 /// Returns the list of directories without those in the overlay.

@@ -8,7 +8,7 @@ use ros::bus::{Bus, BusError, ParamValue};
 use ros::ros1::own_parameters::is_set_by_master;
 
 /// Parameters already reported; each is reported once per run of the stub.
-static TOLD: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+static REPORTED_PARAMETERS: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 /// Returns all parameters as a tree, without the Master's own. Unreadable ones are omitted and reported in the log.
 pub async fn read_all(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
@@ -60,7 +60,7 @@ pub fn make_transferable(name: &str, value: &mut Option<ParamValue>) -> bool {
 }
 
 fn warn_once(name: &str, reason: &dyn std::fmt::Display) {
-    if TOLD.lock().insert(name.to_owned()) {
+    if REPORTED_PARAMETERS.lock().insert(name.to_owned()) {
         tracing::warn!(
             "parameter {name} has a value that XML-RPC cannot represent ({reason}), so the node in the cloud does not \
                 get it; correct it, or remove it with: rosparam delete {name}"
@@ -124,7 +124,7 @@ mod tests {
         assert!(!make_transferable("/n", &mut Some(ParamValue::Nil)));
         assert!(make_transferable("/n", &mut None), "deleted");
         for name in ["/n/nothing", "/n/holes", "/n/below/nothing", "/n"] {
-            assert!(TOLD.lock().contains(name), "{name}");
+            assert!(REPORTED_PARAMETERS.lock().contains(name), "{name}");
         }
     }
 }

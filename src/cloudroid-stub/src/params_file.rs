@@ -8,18 +8,13 @@
 //!     gains: {p: 1.0}   # gains.p
 //! ```
 
-mod events;
-pub mod value;
-
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use ros::bus::ParamValue;
 use ros::ros2::arguments::is_token;
-use saphyr_parser::Event;
-
-use events::{Problem, YamlEvents};
+use ros::ros2::parameters::yaml::{Event, NO_VALUE, Problem, YamlEvents, parse_event};
 
 /// Maximum file size in bytes.
 const MAX_BYTES: u64 = 8 << 20;
@@ -117,7 +112,7 @@ struct ParametersFileReader<'a, 's> {
 impl ParametersFileReader<'_, '_> {
     fn read(&mut self) -> Result<(), Problem> {
         loop {
-            let (event, line) = self.events.next()?;
+            let (event, line) = self.events.next_event()?;
             match event {
                 Event::StreamStart | Event::DocumentStart(_) | Event::DocumentEnd => {}
                 Event::StreamEnd => return Ok(()),
@@ -132,7 +127,7 @@ impl ParametersFileReader<'_, '_> {
     /// Reads names of nodes, and of namespaces around them.
     fn nodes(&mut self, above: &str, depth: usize) -> Result<(), Problem> {
         while let Some((key, line)) = self.key(depth)? {
-            let (event, at) = self.events.next()?;
+            let (event, at) = self.events.next_event()?;
             let is_group = matches!(event, Event::MappingStart(..));
             if key == PARAMETERS {
                 if above.is_empty() {
@@ -171,14 +166,14 @@ impl ParametersFileReader<'_, '_> {
                 "" => key,
                 _ => format!("{above}.{key}"),
             };
-            let (event, at) = self.events.next()?;
+            let (event, at) = self.events.next_event()?;
             if matches!(event, Event::MappingStart(..)) {
                 self.parameters(nodes, &name, depth + 1)?;
                 continue;
             }
-            let value = value::parse_event(event, at, &mut self.events).map_err(|problem| {
+            let value = parse_event(event, at, &mut self.events).map_err(|problem| {
                 // An empty value has the position of the next token.
-                let line = if problem.reason == value::NO_VALUE { line } else { problem.line };
+                let line = if problem.reason == NO_VALUE { line } else { problem.line };
                 Problem::new(line, format!("{name}: {}", problem.reason))
             })?;
             self.found.set(nodes, name, value);
@@ -188,7 +183,7 @@ impl ParametersFileReader<'_, '_> {
 
     /// Returns the next key of a group and its line, or `None` at its end.
     fn key(&mut self, depth: usize) -> Result<Option<(String, usize)>, Problem> {
-        let (event, line) = self.events.next()?;
+        let (event, line) = self.events.next_event()?;
         match event {
             Event::MappingEnd => Ok(None),
             _ if depth > MAX_DEPTH => Err(Problem::new(line, format!("more than {MAX_DEPTH} nested groups"))),

@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use budget::Budget;
 use futures_util::FutureExt;
 use link::control::{Exit, Hello};
@@ -30,6 +30,7 @@ use crate::farewell;
 use crate::linked;
 use crate::local::{OriginalProgram, OriginalSetup};
 use crate::machine;
+use crate::middleware::{self, RobotMiddleware};
 use crate::mirror::diagnostics::Diagnostics;
 use crate::mirror::requests::RequestPattern;
 use crate::mirror::{Mirror, promise};
@@ -69,6 +70,9 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
     let checked = RosSetup::read(&variable).map_or(Ok(()), |found| found.check(ros));
     if let Err(error) = checked {
         bail!("{error}; {}", setup::advice(ros, &config.service));
+    }
+    if ros == RosVersion::Two {
+        RobotMiddleware::read(&variable).map_err(|error| anyhow!("{error}; {}", middleware::advice()))?;
     }
     let executable = &asked.node.node;
     let found = made_of.names.get(executable);

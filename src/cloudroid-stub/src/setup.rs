@@ -12,7 +12,7 @@ pub const VERSION: &str = "ROS_VERSION";
 const DISTRIBUTION: &str = "ROS_DISTRO";
 
 /// Distributions of ROS 1 that robots still run (REP 3, <https://ros.org/reps/rep-0003.html>; `one` is ROS-O).
-const OF_ONE: [&str; 7] = ["indigo", "jade", "kinetic", "lunar", "melodic", "noetic", "one"];
+const ROS1_DISTRIBUTIONS: [&str; 7] = ["indigo", "jade", "kinetic", "lunar", "melodic", "noetic", "one"];
 /// Distributions of ROS 2 (REP 2000, <https://ros.org/reps/rep-2000.html>).
 const OF_TWO: [&str; 12] = [
     "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron", "jazzy", "kilted",
@@ -37,7 +37,7 @@ pub struct OtherRosError {
 /// The ROS that an environment says is set up.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RosSetup {
-    /// Its version.
+    /// ROS version of the setup file.
     pub version: RosVersion,
     /// Name of its distribution; empty if it is not set.
     pub distribution: String,
@@ -90,7 +90,7 @@ pub fn advice(wanted: RosVersion, service: &str) -> String {
 }
 
 fn version_of_distribution(name: &str) -> Option<RosVersion> {
-    if OF_ONE.contains(&name) {
+    if ROS1_DISTRIBUTIONS.contains(&name) {
         return Some(RosVersion::One);
     }
     OF_TWO.contains(&name).then_some(RosVersion::Two)

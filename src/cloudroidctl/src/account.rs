@@ -1,6 +1,6 @@
 //! `account`: accounts of people who sign in with a password.
 
-mod password;
+pub mod password;
 
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 

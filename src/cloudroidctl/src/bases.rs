@@ -1,16 +1,21 @@
 //! `bases`: what images are built upon, and moving it to another server.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
 
-use anyhow::Context;
-use api::Size;
+use anyhow::{Context, ensure};
 use api::bases::{BaseDetail, BaseState, BaseSummary};
-use hyper::Method;
+use api::{Size, count};
+use hyper::body::Incoming;
+use hyper::{Method, Response};
+use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::account::password::read_existing_password;
 use crate::client::{self, DaemonClient, percent_encode};
 use crate::output::{self, OutputFormat, Table};
 use crate::push;
+use crate::registry::{self, Credentials, ImageReference, PullSize};
 
 /// List bases and what each has, move one to another server, and make one of your own image.
 ///
@@ -60,9 +65,13 @@ struct ExportBase {
 
 /// Import a base: an image, a root file system, or one that `cloudroidctl base export` has written.
 ///
-/// With --from, a new base is made of what a lab has: the archive of an image (podman save, docker save, skopeo copy to
-/// oci-archive or oci), or the root file system of a robot or of mmdebstrap as tar, gzip or zstd. Its layers are kept
-/// as they are; what they hold is found by looking and printed as a table.
+/// With --from, a new base is made of what a lab has: an image of a registry (docker://HOST/REPOSITORY:TAG), the
+/// archive of an image (podman save, docker save, skopeo copy to oci-archive or oci), or the root file system of a
+/// robot or of mmdebstrap as tar, gzip or zstd. Its layers are kept as they are; what they hold is found by looking and
+/// printed as a table.
+///
+/// Registries are asked from here, not by the server, and with the password of podman login or docker login unless
+/// there is --user.
 ///
 /// Without --from, the server must have the same definition of the base. Packages that need nothing else are pushed
 /// without any download.
@@ -71,9 +80,16 @@ struct ImportBase {
     /// Name of the new base with --from, else the file written by base export.
     #[arg(value_name = "NAME|FILE")]
     what: PathBuf,
-    /// Image or root file system: an archive, the directory of an OCI image layout, or - for standard input.
-    #[arg(long, value_name = "FILE")]
+    /// Image or root file system: docker://HOST/REPOSITORY:TAG, an archive, the directory of an OCI image layout, or -
+    /// for standard input.
+    #[arg(long, value_name = "IMAGE")]
     from: Option<PathBuf>,
+    /// User name for the registry; its password is asked for.
+    #[arg(long, value_name = "NAME", requires = "from")]
+    user: Option<String>,
+    /// Read the password from the first line of standard input.
+    #[arg(long, requires = "user")]
+    password_stdin: bool,
     /// Replace an imported base of this name. Services keep the layers that they were built on.
     #[arg(long, requires = "from")]
     replace: bool,
@@ -125,6 +141,36 @@ impl ExportBase {
 }
 
 impl ImportBase {
+    /// Sends the image or root file system.
+    async fn send_image(&self, client: &DaemonClient, path: &str, from: &Path) -> anyhow::Result<Response<Incoming>> {
+        let Some(image) = from.to_str().filter(|text| text.starts_with(registry::SCHEME)) else {
+            ensure!(self.user.is_none(), "--user is for images of registries, {}HOST/REPOSITORY:TAG", registry::SCHEME);
+            return client.send(Method::PUT, path, push::image_body(from)?).await;
+        };
+        let image: ImageReference = image.parse()?;
+        let architecture = find_architecture(client).await?;
+        let found = registry::find_image(&image, self.read_credentials(&image)?, &architecture).await?;
+        let PullSize { layers, bytes } = found.size();
+        output::eprint_line(&format!("pulling {image}: {}, {}", count(layers, "layer"), Size(bytes)));
+        let bar = new_bar(bytes);
+        let arriving = bar.clone();
+        let (body, pulling) = found.into_body(move |bytes| arriving.inc(bytes));
+        let answer = client.send(Method::PUT, path, body).await;
+        bar.finish_and_clear();
+        // Whatever the daemon reports about the truncated archive, that is the cause.
+        answer.map_err(|error| pulling.into_error().unwrap_or(error))
+    }
+
+    /// Reads the password of the user that was named, if one was.
+    fn read_credentials(&self, image: &ImageReference) -> anyhow::Result<Option<Credentials>> {
+        let Some(user) = &self.user else {
+            return Ok(None);
+        };
+        let prompt = format!("Password of {user} for {}: ", image.registry);
+        let password = read_existing_password(self.password_stdin, &prompt)?;
+        Credentials::new(user.clone(), password).map(Some)
+    }
+
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let answer = match &self.from {
             Some(from) => {
@@ -133,7 +179,7 @@ impl ImportBase {
                 if let Some(distribution) = &self.ros_distro {
                     path += &format!("&ros_distro={}", percent_encode(distribution));
                 }
-                client.send(Method::PUT, &path, push::image_body(from)?).await?
+                self.send_image(client, &path, from).await?
             }
             None => client.send(Method::POST, "/api/v1/bases", push::file_body(&self.what)?).await?,
         };
@@ -147,6 +193,28 @@ impl ImportBase {
                 print_findings(&base)
             }
         }
+    }
+}
+
+/// Returns the architecture of the server in the terms of image registries, which are those of Go.
+async fn find_architecture(client: &DaemonClient) -> anyhow::Result<String> {
+    let status: api::Status = client.get("/api/v1/status").await?;
+    let name = if status.architecture.is_empty() { std::env::consts::ARCH } else { status.architecture.as_str() };
+    Ok(match name {
+        "x86_64" => "amd64",
+        "aarch64" => "arm64",
+        other => other,
+    }
+    .to_owned())
+}
+
+/// Shows how much of an image was pulled, on a terminal.
+fn new_bar(bytes: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:30} {bytes}/{total_bytes} {bytes_per_sec} {eta}");
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(bytes) } else { ProgressBar::hidden() };
+    match style {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
     }
 }
 
@@ -249,6 +317,9 @@ mod tests {
         assert_eq!(parse(&["show"]).expect_err("no name").exit_code(), 2);
         for alone in [&["import", "x", "--replace"][..], &["import", "x", "--ros-distro", "jazzy"], &["import"]] {
             assert_eq!(parse(alone).expect_err("nothing to make it from").exit_code(), 2);
+        }
+        for alone in [&["import", "x", "--user", "me"][..], &["import", "x", "--from", "y", "--password-stdin"]] {
+            assert_eq!(parse(alone).expect_err("nothing to log in to").exit_code(), 2);
         }
         let import = parse(&["import", "mine", "--from", "image.tar", "--replace"]).expect("valid");
         assert!(matches!(import, Some(BasesCommand::Import(import)) if import.replace));

@@ -16,7 +16,7 @@ use hyper::Method;
 use crate::client::{self, DaemonClient, percent_encode};
 use crate::confirm;
 use crate::output::{self, OutputFormat, Table, count};
-use crate::stated::aux;
+use crate::terms_flags::aux;
 use crate::trial::describe_renamed_topics;
 
 /// Measure how fast a service answers recorded requests at several CPU limits, and propose entries of its SLA table.

@@ -36,14 +36,15 @@ const FALLBACK: &str = "127.0.0.1:9090";
 const CONNECTING: Duration = Duration::from_secs(10);
 
 /// Advice after a response of 401.
-const TOKEN_WANTED: &str = "pass a token created by an admin with --token TOKEN or CLOUDROID_TOKEN; root and members \
+const TOKEN_ADVICE: &str = "pass a token created by an admin with --token TOKEN or CLOUDROID_TOKEN; root and members \
     of the group cloudroid need none on the server itself (--server unix:PATH)";
 
 /// Advice when no authorities are installed.
-const NOBODY_TRUSTED: &str = "no certificate authorities are installed here, and the server's certificate is not \
+const AUTHORITY_ADVICE: &str = "no certificate authorities are installed here, and the server's certificate is not \
     self-signed: apt install ca-certificates";
 
-const NAME: &str = concat!("cloudroidctl/", env!("CARGO_PKG_VERSION"));
+/// Name of this program in requests.
+pub const NAME: &str = concat!("cloudroidctl/", env!("CARGO_PKG_VERSION"));
 
 /// A WebSocket to the daemon.
 pub type DaemonSocket = WebSocketStream<TokioIo<Upgraded>>;
@@ -308,7 +309,7 @@ impl DaemonClient {
             fingerprint: None,
             known,
             accept: format!("cloudroidctl trust {}", self.server),
-            advice: NOBODY_TRUSTED,
+            advice: AUTHORITY_ADVICE,
             identity: None,
         };
         let connecting = trust.connect(stream, host.trim_matches(['[', ']']), authority);
@@ -403,7 +404,7 @@ async fn error_from_response(response: Response<Incoming>) -> anyhow::Error {
         Ok(mut problem) => {
             if status == StatusCode::UNAUTHORIZED {
                 // The daemon's advice is for HTTP clients; here the token is an option.
-                problem.next = Some(TOKEN_WANTED.to_owned());
+                problem.next = Some(TOKEN_ADVICE.to_owned());
             }
             problem.into()
         }

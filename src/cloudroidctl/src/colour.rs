@@ -11,7 +11,7 @@ pub enum Colour {
     Yellow,
     /// Failed.
     Red,
-    /// Of little interest.
+    /// Minor detail.
     Dim,
 }
 

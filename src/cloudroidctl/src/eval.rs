@@ -6,8 +6,8 @@ mod measure;
 mod network;
 mod plot;
 mod probe;
+mod report;
 mod robot;
-mod shown;
 mod side;
 mod verdict;
 
@@ -85,7 +85,7 @@ impl EvalArgs {
         let file = fs::read(&self.bag).with_context(|| format!("cannot read {}", self.bag.display()))?;
         let file = Bytes::from(file);
         // A recording that cannot be replayed is reported before anything is sent or started.
-        let recorded = ros::bag::read(&file, probe::RECORDED)
+        let recorded = ros::bag::read(&file, probe::MAX_RECORDED)
             .map_err(|why| invalid_input(format!("{} cannot be replayed: {why}", self.bag.display())))?;
         let service = self.check(client).await?;
         self.check_capacity(client).await?;
@@ -103,7 +103,7 @@ impl EvalArgs {
         let written = if is_written { self.write_row(client, &mut measured).await.map(drop) } else { Ok(()) };
         match format {
             OutputFormat::Json => output::json(&measured)?,
-            OutputFormat::Table => shown::print(&measured, &plot)?,
+            OutputFormat::Table => report::print(&measured, &plot)?,
         }
         if let Err(error) = drawn {
             output::eprint_line(&format!("warning: {error:#}"));

@@ -12,7 +12,7 @@ use crate::confirm::{YesFlag, ask};
 use crate::output;
 
 /// Maximum number of robots that the warning names.
-const NAMED: usize = 10;
+const MAX_NAMED_ROBOTS: usize = 10;
 
 /// Connected robots without credentials.
 #[derive(Debug, Default, PartialEq, Eq)]
@@ -50,8 +50,8 @@ impl OpenRobots {
 
     /// Returns the names, shortened, for a sentence.
     fn names(&self) -> String {
-        let mut names: Vec<String> = self.named.iter().take(NAMED).cloned().collect();
-        if let Some(more) = self.named.len().checked_sub(NAMED).filter(|more| *more > 0) {
+        let mut names: Vec<String> = self.named.iter().take(MAX_NAMED_ROBOTS).cloned().collect();
+        if let Some(more) = self.named.len().checked_sub(MAX_NAMED_ROBOTS).filter(|more| *more > 0) {
             names.push(format!("{more} more"));
         }
         if self.nameless > 0 {

@@ -4,7 +4,7 @@ use api::Size;
 
 use crate::client::{DaemonClient, percent_encode};
 use crate::output::{self, OutputFormat, Table, count};
-use crate::stated::{StatedFlags, to_query};
+use crate::terms_flags::{StatedFlags, to_query};
 
 /// Predict whether the server has capacity for another robot, what it would cost the others, and how many more would
 /// fit.

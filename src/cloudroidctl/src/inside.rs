@@ -90,7 +90,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
     }
 
     fn poll_send(&mut self, cx: &mut Context<'_>, waiting: &mut Option<Message>) -> Poll<anyhow::Result<()>> {
-        const BROKEN: &str = "the daemon broke the connection";
+        const CONNECTION_BROKEN: &str = "the daemon broke the connection";
         while let Poll::Ready(came) = self.socket.poll_next_unpin(cx) {
             match came {
                 Some(Ok(Message::Close(close))) => {
@@ -98,17 +98,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
                     return Poll::Ready(over.and_then(Err));
                 }
                 Some(Ok(message)) => self.ahead.push_back((Instant::now(), message)),
-                Some(Err(error)) => return Poll::Ready(Err(error).context(BROKEN)),
-                None => return Poll::Ready(Err(anyhow!(BROKEN))),
+                Some(Err(error)) => return Poll::Ready(Err(error).context(CONNECTION_BROKEN)),
+                None => return Poll::Ready(Err(anyhow!(CONNECTION_BROKEN))),
             }
         }
         if waiting.is_some() {
-            ready!(self.socket.poll_ready_unpin(cx)).context(BROKEN)?;
+            ready!(self.socket.poll_ready_unpin(cx)).context(CONNECTION_BROKEN)?;
         }
         if let Some(message) = waiting.take() {
-            self.socket.start_send_unpin(message).context(BROKEN)?;
+            self.socket.start_send_unpin(message).context(CONNECTION_BROKEN)?;
         }
-        self.socket.poll_flush_unpin(cx).map_err(|error| anyhow::Error::new(error).context(BROKEN))
+        self.socket.poll_flush_unpin(cx).map_err(|error| anyhow::Error::new(error).context(CONNECTION_BROKEN))
     }
 
     /// Returns the next message; `None` if the servant has ended.

@@ -33,11 +33,11 @@ mod moment;
 mod output;
 mod pair;
 mod policy;
-mod published;
 mod push;
 mod pushes;
 mod record;
 mod recordings;
+mod registry;
 mod replay;
 mod rm;
 mod rollback;
@@ -47,14 +47,15 @@ mod services;
 mod set;
 mod shadow;
 mod sla;
-mod stated;
 mod status;
 mod stop;
 mod stream;
 mod stub;
 mod synonyms;
+mod terms_flags;
 mod token;
 mod top;
+mod topic_selection;
 mod topics;
 mod trial;
 mod trust;
@@ -117,7 +118,7 @@ enum CtlCommand {
     Record(record::RecordArgs),
     Replay(replay::ReplayArgs),
     Recordings(recordings::RecordingsArgs),
-    Topics(published::TopicsArgs),
+    Topics(topics::TopicsArgs),
     Goals(goals::GoalsArgs),
     Events(events::EventsArgs),
     Set(set::SetArgs),

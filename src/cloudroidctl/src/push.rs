@@ -1,22 +1,20 @@
 //! `push`: publishes a package as a service.
 
-mod archive;
+pub mod archive;
 mod ignore;
 mod interrupt;
 pub mod progress;
 mod selection;
+mod sending;
 mod shared;
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use anyhow::{Context, bail, ensure};
 use api::push::ParsePairError;
-use api::{Grants, PushEvent, PushOptions, PushStatus, ServiceDetail, Sla, Span, Volume};
-use futures_util::StreamExt;
-use hyper::{HeaderMap, Method, header};
+use api::{Grants, PushOptions, ServiceDetail, Sla, Span, Volume};
 
-use crate::client::{self, DaemonClient, RequestBody, percent_encode};
+use crate::client::{DaemonClient, RequestBody, percent_encode};
 use crate::limits::{CapFlags, LimitFlags};
 use crate::output::{self, OutputFormat};
 use crate::push::shared::SharedFlags;
@@ -26,6 +24,7 @@ use crate::wait::WaitFlag;
 use archive::PushSource;
 use interrupt::InterruptAnswer;
 use progress::PushProgress;
+use sending::PushRequest;
 
 /// Largest query in bytes: HTTP servers refuse longer ones.
 const LONGEST_QUERY: usize = 60_000;
@@ -251,43 +250,8 @@ impl PushArgs {
         if uri.len() > LONGEST_QUERY {
             bail!("the options are too long, {} bytes; shorten --interface or the parameters", uri.len());
         }
-        let state = SentPush::default();
-        let mut progress = PushProgress::new(format);
-        let pause = progress.pauses();
-        let mut sending = Box::pin(send(client, &mut progress, (uri.as_str(), source, self.detach), &state));
-        let mut is_stopping = false;
-        loop {
-            tokio::select! {
-                outcome = &mut sending => match outcome {
-                    Err(_) if is_stopping => bail!(CANCELLED),
-                    outcome => return outcome,
-                },
-                _ = tokio::signal::ctrl_c() => {}
-            }
-            let Some(number) = state.number() else { bail!(CANCELLED) };
-            if !state.is_accepted() {
-                // It ends with this command; if it was just accepted, by being cancelled.
-                let _ = stop(client, number).await;
-                bail!(CANCELLED);
-            }
-            if is_stopping {
-                bail!("push {number} is being cancelled; see cloudroidctl pushes");
-            }
-            if state.publishing.load(Ordering::Relaxed) {
-                bail!("interrupted, but the daemon goes on publishing; see cloudroidctl services");
-            }
-            pause.begin();
-            let answer = on_interrupt(number).await;
-            pause.end();
-            match answer {
-                InterruptAnswer::Stop => is_stopping = stop(client, number).await?,
-                InterruptAnswer::Leave => {
-                    output::eprint_line(&continuation(number));
-                    return Ok(None);
-                }
-                InterruptAnswer::Follow => {}
-            }
-        }
+        let sent = PushRequest { uri, source, is_detached: self.detach };
+        sending::publish(client, sent, PushProgress::new(format), on_interrupt).await
     }
 
     fn options(&self) -> anyhow::Result<PushOptions> {
@@ -355,8 +319,8 @@ pub fn image_body(path: &Path) -> anyhow::Result<RequestBody> {
     }
     let about = match std::fs::metadata(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => bail!(
-            "{name} is not a file here; an image of a registry is saved first: skopeo copy docker://NAME \
-                oci-archive:image.tar (or podman pull NAME; podman save NAME > image.tar)",
+            "{name} is not a file here; an image of a registry is named docker://HOST/REPOSITORY:TAG, one of podman or \
+                docker on this machine is saved first: podman save NAME > image.tar",
             name = path.display()
         ),
         about => about.with_context(|| format!("cannot read {}", path.display()))?,
@@ -371,131 +335,6 @@ pub fn image_body(path: &Path) -> anyhow::Result<RequestBody> {
         name = path.display()
     );
     Ok(PushSource::Layout(path.to_owned()).into_body().0)
-}
-
-/// Message for a push that was stopped from here.
-const CANCELLED: &str = "cancelled; nothing was published";
-
-/// State of the push that is being sent.
-#[derive(Debug, Default)]
-struct SentPush {
-    /// Number of the push; 0 while it is unknown.
-    number: AtomicU64,
-    /// True once the push continues without this command.
-    accepted: AtomicBool,
-    /// True once the daemon publishes, after which the push cannot be cancelled.
-    publishing: AtomicBool,
-}
-
-impl SentPush {
-    fn number(&self) -> Option<u64> {
-        Some(self.number.load(Ordering::Relaxed)).filter(|number| *number > 0)
-    }
-
-    fn is_accepted(&self) -> bool {
-        self.accepted.load(Ordering::Relaxed)
-    }
-
-    /// Reads the number of the push from the head of the response.
-    fn read_number(&self, headers: &HeaderMap) {
-        let location = headers.get(header::LOCATION).and_then(|location| location.to_str().ok());
-        let number = location.and_then(|location| location.rsplit('/').next()?.parse().ok());
-        self.number.store(number.unwrap_or_default(), Ordering::Relaxed);
-    }
-}
-
-/// Cancels a push; false if that is too late, which its output then shows.
-async fn stop(client: &DaemonClient, number: u64) -> anyhow::Result<bool> {
-    match client.delete::<PushStatus>(&format!("/api/v1/pushes/{number}")).await {
-        Ok(_) => Ok(true),
-        Err(error) if error.downcast_ref::<api::Problem>().is_some_and(|problem| problem.status == 409) => {
-            output::eprint_line(&format!("{error:#}"));
-            Ok(false)
-        }
-        Err(error) => Err(error),
-    }
-}
-
-/// Describes how to go on with a push that continues without this command.
-fn continuation(number: u64) -> String {
-    format!(
-        "push {number} continues on the server; follow it with: cloudroidctl pushes logs {number} --follow; stop it \
-            with: cloudroidctl pushes cancel {number}"
-    )
-}
-
-/// Sends the package and shows the progress until the push ends; with `detach` only until the package is sent. Returns
-/// `None` if the push continues, and for an underlay.
-async fn send(
-    client: &DaemonClient,
-    progress: &mut PushProgress,
-    (uri, source, detach): (&str, Option<PushSource>, bool),
-    state: &SentPush,
-) -> anyhow::Result<Option<ServiceDetail>> {
-    let (body, packing) = match source {
-        Some(source) => {
-            let (body, packing) = source.into_body();
-            (body, Some(packing))
-        }
-        None => (client::empty_body(), None),
-    };
-    let response = match client.send(Method::POST, uri, body).await {
-        Ok(response) => response,
-        Err(error) => return Err(packing_error(packing).unwrap_or(error)),
-    };
-    state.read_number(response.headers());
-    let mut events = client::json_lines::<PushEvent>(response);
-    let mut ticks = tokio::time::interval(progress::TICK);
-    loop {
-        let event = tokio::select! {
-            event = events.next() => event,
-            _ = ticks.tick() => {
-                if !detach {
-                    progress.tick()?;
-                }
-                continue;
-            }
-        };
-        let accepted = state.number().filter(|_| state.is_accepted());
-        let event = match (event, accepted) {
-            (Some(Ok(event)), _) => event,
-            (Some(Err(error)), Some(number)) if client::is_unavailable(&error) => {
-                return Err(error.context(format!("lost sight of push {number}; see cloudroidctl pushes")));
-            }
-            (Some(Err(error)), _) => return Err(packing_error(packing).unwrap_or(error)),
-            (None, _) => bail!("the daemon aborted the push; see its log, and cloudroidctl status"),
-        };
-        if !detach {
-            progress.show(&event)?;
-        }
-        match event {
-            PushEvent::Accepted { number } => {
-                state.number.store(number, Ordering::Relaxed);
-                state.accepted.store(true, Ordering::Relaxed);
-                if detach {
-                    output::eprint_line(&continuation(number));
-                    progress.show_number(number)?;
-                    return Ok(None);
-                }
-            }
-            // Title of the daemon's last step.
-            PushEvent::Step { title, .. } if title == api::push::PUBLISHING => {
-                state.publishing.store(true, Ordering::Relaxed);
-            }
-            PushEvent::Done { service, .. } => return Ok(Some(*service)),
-            // Nothing of it is run, so there is nothing to describe.
-            PushEvent::Underlay { .. } => return Ok(None),
-            PushEvent::Error { problem } => {
-                return Err(packing_error(packing).unwrap_or_else(|| problem.into()));
-            }
-            _ => {}
-        }
-    }
-}
-
-/// Returns the error of packing, if any: it is the cause, whatever the daemon reported about the truncated stream.
-fn packing_error(packing: Option<archive::Packing>) -> Option<anyhow::Error> {
-    packing.and_then(archive::Packing::into_error)
 }
 
 #[cfg(test)]

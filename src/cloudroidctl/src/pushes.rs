@@ -9,7 +9,7 @@ use crate::output::{self, OutputFormat, Table};
 use crate::push::progress;
 
 /// Number of ended pushes that are listed without `--all`.
-const ENDED: usize = 10;
+const MAX_LISTED_ENDED: usize = 10;
 
 /// List pushes: who pushes what, at which step it is, and for how long.
 ///
@@ -65,7 +65,7 @@ async fn list(client: &DaemonClient, format: OutputFormat, all: bool) -> anyhow:
         let mut ended = 0;
         pushes.retain(|push| {
             ended += usize::from(push.state != PushState::Running);
-            push.state == PushState::Running || ended <= ENDED
+            push.state == PushState::Running || ended <= MAX_LISTED_ENDED
         });
     }
     if format == OutputFormat::Json {

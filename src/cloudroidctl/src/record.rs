@@ -16,7 +16,7 @@ use crate::client::DaemonClient;
 use crate::inside::{self, FoxgloveSession};
 use crate::output::{self, OutputFormat, count};
 use crate::token::lifetime;
-use crate::topics::TopicFilter;
+use crate::topic_selection::TopicFilter;
 
 /// Length of the daemon's queue for each topic, for while the file is written.
 const DEPTH: usize = 1000;

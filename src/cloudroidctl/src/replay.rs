@@ -17,7 +17,7 @@ use tokio_tungstenite::tungstenite::Message;
 use crate::client::DaemonClient;
 use crate::inside::{self, FoxgloveSession};
 use crate::output::{self, OutputFormat};
-use crate::topics::TopicFilter;
+use crate::topic_selection::TopicFilter;
 
 /// Length of the daemon's queue for each topic, for slow nodes.
 const DEPTH: usize = 1000;

@@ -10,7 +10,7 @@ use api::{Limits, Measure};
 use crate::client::{DaemonClient, percent_encode};
 use crate::limits::LimitFlags;
 use crate::output::{self, OutputFormat, Table};
-use crate::stated::{StatedFlags, aux, to_query, unique_aux};
+use crate::terms_flags::{StatedFlags, aux, to_query, unique_aux};
 
 /// Manage the SLA table of a service, which maps SLAs to resources: list, set, remove and explain its entries.
 #[derive(Debug, clap::Args)]

@@ -40,7 +40,7 @@ enum SortKey {
     Memory,
     /// Longest response time first.
     Rrt,
-    /// By service and robot.
+    /// Order by service and robot.
     Name,
 }
 

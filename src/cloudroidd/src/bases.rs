@@ -10,18 +10,27 @@ use crate::home::Home;
 use store::private;
 
 /// Files of `images/` in the source tree.
-const BUILT_IN: [(&str, &str); 4] = [
+const BUILT_IN: [(&str, &str); 7] = [
     (
         "bookworm-jazzy-wheels.build.requirements.txt",
         include_str!("../../../images/bookworm-jazzy-wheels.build.requirements.txt"),
     ),
     ("bookworm-jazzy-wheels.requirements.txt", include_str!("../../../images/bookworm-jazzy-wheels.requirements.txt")),
     ("bookworm-jazzy-wheels.toml", include_str!("../../../images/bookworm-jazzy-wheels.toml")),
+    (
+        "bookworm-kilted-wheels.build.requirements.txt",
+        include_str!("../../../images/bookworm-kilted-wheels.build.requirements.txt"),
+    ),
+    (
+        "bookworm-kilted-wheels.requirements.txt",
+        include_str!("../../../images/bookworm-kilted-wheels.requirements.txt"),
+    ),
+    ("bookworm-kilted-wheels.toml", include_str!("../../../images/bookworm-kilted-wheels.toml")),
     ("bookworm-ros1.toml", include_str!("../../../images/bookworm-ros1.toml")),
 ];
 
 /// Directory of the home with the definitions of bases that were made from images.
-pub const IMPORTED: &str = "bases";
+pub const IMPORTED_DIRECTORY: &str = "bases";
 
 /// Returns whether a file is a definition or the requirements of one.
 fn is_definition_file(name: &str) -> bool {
@@ -37,7 +46,7 @@ pub fn write_definitions(config: &Config, home: &Home) -> anyhow::Result<PathBuf
         std::fs::remove_dir_all(&directory).with_context(made)?;
     }
     private::make_directory(&directory).with_context(made)?;
-    let imported = home.path().join(IMPORTED);
+    let imported = home.path().join(IMPORTED_DIRECTORY);
     private::make_directory(&imported).with_context(made)?;
     let copied = copy_definitions(&imported, &directory)?;
     for (name, text) in BUILT_IN {
@@ -97,7 +106,7 @@ mod tests {
         std::fs::write(theirs.path().join("notes.txt"), "no definition").expect("written");
         let parent = tempfile::tempdir().expect("a directory");
         let home = Home::open(parent.path()).expect("free");
-        let imported = home.path().join(IMPORTED);
+        let imported = home.path().join(IMPORTED_DIRECTORY);
         std::fs::create_dir(&imported).expect("made");
         for name in ["bookworm-ros1.toml", "other.toml", "robot.toml"] {
             std::fs::write(imported.join(name), "imported").expect("written");

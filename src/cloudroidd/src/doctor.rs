@@ -15,10 +15,10 @@ use crate::config::TelemetryConfig;
 /// Oldest supported kernel: overlays of idmapped layers need Linux 5.19.
 const OLDEST_KERNEL: (u32, u32) = (5, 19);
 /// Free disk space required and recommended: a base image and one package with its dependencies.
-const ROOM_NEEDED: u64 = 2 << 30;
-const SPACE_WANTED: u64 = 10 << 30;
+const MIN_FREE_SPACE: u64 = 2 << 30;
+const RECOMMENDED_FREE_SPACE: u64 = 10 << 30;
 /// Time in which a server must accept a connection.
-const CONNECTED: Duration = Duration::from_secs(2);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are
 /// problems of the configuration; `collector` is where traces are sent.
@@ -228,8 +228,10 @@ fn disk_space(home: &Path) -> Check {
     let text = format!("{} free at {}", Size(free), existing.display());
     let fix = "free some space, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {
-        _ if free < ROOM_NEEDED => missing(NAME, format!("{text}; a first push needs {}", Size(ROOM_NEEDED)), fix),
-        _ if free < SPACE_WANTED => warning(NAME, text, fix),
+        _ if free < MIN_FREE_SPACE => {
+            missing(NAME, format!("{text}; a first push needs {}", Size(MIN_FREE_SPACE)), fix)
+        }
+        _ if free < RECOMMENDED_FREE_SPACE => warning(NAME, text, fix),
         _ => ok(NAME, text),
     }
 }
@@ -265,7 +267,7 @@ fn telemetry(collector: &TelemetryConfig) -> Check {
     let connected = server.and_then(|(host, port)| {
         let mut failed = anyhow::anyhow!("{host} has no address");
         for address in (host.as_str(), port).to_socket_addrs()? {
-            match TcpStream::connect_timeout(&address, CONNECTED) {
+            match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
                 Ok(_) => return Ok(()),
                 Err(error) => failed = error.into(),
             }

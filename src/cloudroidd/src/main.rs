@@ -90,7 +90,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Does what the command line says, until that is done or the daemon is stopped.
+/// Runs the verb of the command line until it is done or the daemon is stopped.
 fn run_command(arguments: DaemonArguments) -> anyhow::Result<()> {
     let config = Config::read(arguments.config.as_deref())?;
     log::start(arguments.log_format.unwrap_or(config.log_format));

@@ -42,7 +42,7 @@ const QUEUE: usize = 2048;
 /// Maximum number of traces of one request to the collector.
 const BATCH: usize = 512;
 /// Interval in which traces are gathered.
-const GATHERED: Duration = Duration::from_secs(1);
+const BATCH_INTERVAL: Duration = Duration::from_secs(1);
 /// Timeout of a request to the collector, and of all attempts to send one batch.
 const TIME: Duration = Duration::from_secs(10);
 /// Limit on the collector's answer in bytes.
@@ -50,7 +50,7 @@ const ANSWER: usize = 64 << 10;
 /// Longest time in milliseconds that a robot is believed: a day.
 const LONGEST: f64 = 86_400e3;
 /// Maximum number of characters of a robot's text in an attribute.
-const WORDS: usize = 200;
+const MAX_ATTRIBUTE_LENGTH: usize = 200;
 
 /// Starts exporting traces to the collector of the configuration. Must be called within a runtime of threads without
 /// privileges: the collector's answers are read there.
@@ -135,7 +135,7 @@ async fn export(exporter: impl SpanExporter, mut queued: mpsc::Receiver<Vec<Span
             dropped.fetch_add(count, Ordering::Relaxed);
         }
         if queued.len() < BATCH {
-            tokio::time::sleep(GATHERED).await;
+            tokio::time::sleep(BATCH_INTERVAL).await;
         }
     }
 }
@@ -237,7 +237,7 @@ fn make_span(
 /// Returns the attributes of a request's root span.
 fn describe(servant: TracedServant<'_>, request: &MeasuredRequest<'_>) -> Vec<KeyValue> {
     let text = |key: &'static str, value: &str| {
-        let value: String = value.chars().take(WORDS).collect();
+        let value: String = value.chars().take(MAX_ATTRIBUTE_LENGTH).collect();
         KeyValue::new(key, value)
     };
     let timing = request.timing;
@@ -310,7 +310,7 @@ mod tests {
     const SERVANT: TracedServant<'static> =
         TracedServant { service: "faces", servant: "faces-4kq2", robot: Some("r2d2") };
 
-    fn answered() -> RequestTiming {
+    fn answered_timing() -> RequestTiming {
         RequestTiming {
             id: 7,
             name: "/image".to_owned(),
@@ -325,13 +325,13 @@ mod tests {
         }
     }
 
-    fn measured(timing: &RequestTiming, update: RequestUpdate) -> MeasuredRequest<'_> {
+    fn measured_request(timing: &RequestTiming, update: RequestUpdate) -> MeasuredRequest<'_> {
         MeasuredRequest { session: "run-1", node: "/detector", max: Some(80.0), timing, update }
     }
 
     fn spans_of(timing: &RequestTiming, update: RequestUpdate, now: SystemTime) -> Vec<SpanData> {
         let ids = RequestIds::derive("run-1", timing.id);
-        make_spans(SERVANT, &measured(timing, update), &ids, now)
+        make_spans(SERVANT, &measured_request(timing, update), &ids, now)
     }
 
     fn attribute(span: &SpanData, key: &str) -> Option<String> {
@@ -355,7 +355,7 @@ mod tests {
     fn phases_follow_each_other_within_the_request() {
         let now = SystemTime::now();
         let ms = Duration::from_millis;
-        let spans = spans_of(&answered(), RequestUpdate::Answered, now);
+        let spans = spans_of(&answered_timing(), RequestUpdate::Answered, now);
         let times: Vec<(&str, Duration, Duration)> = spans
             .iter()
             .map(|span| {
@@ -403,7 +403,7 @@ mod tests {
         assert!(matches!(late[0].status, Status::Error { .. }));
         let took = now.duration_since(late[0].start_time).expect("before");
         assert_eq!(took, Duration::from_millis(80), "T_max");
-        let added = spans_of(&answered(), RequestUpdate::AnsweredLate, now);
+        let added = spans_of(&answered_timing(), RequestUpdate::AnsweredLate, now);
         assert_eq!(added.len(), 5, "{added:?}");
         for phase in &added {
             assert_eq!(phase.parent_span_id, late[0].span_context.span_id());
@@ -414,15 +414,20 @@ mod tests {
     fn times_of_robots_are_not_trusted() {
         let now = SystemTime::now();
         for time in [f64::NAN, f64::INFINITY, -1.0, 1e300] {
-            let timing =
-                RequestTiming { total: Some(time), up: time, compute: 1.0, name: "x".repeat(10_000), ..answered() };
+            let timing = RequestTiming {
+                total: Some(time),
+                up: time,
+                compute: 1.0,
+                name: "x".repeat(10_000),
+                ..answered_timing()
+            };
             let spans = spans_of(&timing, RequestUpdate::Answered, now);
             assert_eq!(spans.len(), 6);
             for span in &spans {
                 assert!(span.start_time <= span.end_time, "{time}: {span:?}");
             }
             let name = attribute(&spans[0], "cloudroid.request");
-            assert_eq!(name.map(|name| name.len()), Some(WORDS));
+            assert_eq!(name.map(|name| name.len()), Some(MAX_ATTRIBUTE_LENGTH));
         }
     }
 
@@ -432,12 +437,12 @@ mod tests {
         let queue = SpanQueue::start(exporter.clone(), 0.5);
         let mut traces: Vec<String> = Vec::new();
         for id in 0..100 {
-            let timing = RequestTiming { id, ..answered() };
-            queue.record(SERVANT, &measured(&timing, RequestUpdate::Answered));
+            let timing = RequestTiming { id, ..answered_timing() };
+            queue.record(SERVANT, &measured_request(&timing, RequestUpdate::Answered));
             traces.extend(queue.trace_id("run-1", id));
         }
         assert!((20..80).contains(&traces.len()), "{}", traces.len());
-        tokio::time::sleep(GATHERED * 3).await;
+        tokio::time::sleep(BATCH_INTERVAL * 3).await;
         let spans = exporter.get_finished_spans().expect("spans");
         let roots = spans.iter().filter(|span| span.name == "request");
         let exported: Vec<String> = roots.map(|span| span.span_context.trace_id().to_string()).collect();
@@ -448,10 +453,10 @@ mod tests {
     #[tokio::test]
     async fn a_full_queue_drops_whole_traces_and_counts_their_spans() {
         let queue = SpanQueue::start(InMemorySpanExporter::default(), 1.0);
-        let timing = answered();
+        let timing = answered_timing();
         // Nothing is taken from the queue meanwhile: this is the runtime's only thread.
         for _ in 0..QUEUE + 3 {
-            queue.record(SERVANT, &measured(&timing, RequestUpdate::Answered));
+            queue.record(SERVANT, &measured_request(&timing, RequestUpdate::Answered));
         }
         assert_eq!(queue.dropped_spans(), 3 * 6);
     }
@@ -479,8 +484,8 @@ mod tests {
     async fn a_collector_receives_the_trace_that_is_named() {
         let (endpoint, mut received) = collector(StatusCode::OK).await;
         let tracer = start(&config(endpoint)).expect("started");
-        let timing = answered();
-        tracer.record(SERVANT, &measured(&timing, RequestUpdate::Answered));
+        let timing = answered_timing();
+        tracer.record(SERVANT, &measured_request(&timing, RequestUpdate::Answered));
         let (headers, body) = received.recv().await.expect("a request");
         assert_eq!(headers["content-type"], "application/x-protobuf");
         let request = ExportTraceServiceRequest::decode(body).expect("OTLP");
@@ -505,8 +510,8 @@ mod tests {
     async fn what_a_collector_refuses_is_counted() {
         let (endpoint, mut received) = collector(StatusCode::BAD_REQUEST).await;
         let tracer = start(&config(endpoint)).expect("started");
-        let timing = answered();
-        tracer.record(SERVANT, &measured(&timing, RequestUpdate::Answered));
+        let timing = answered_timing();
+        tracer.record(SERVANT, &measured_request(&timing, RequestUpdate::Answered));
         received.recv().await.expect("a request");
         while tracer.dropped_spans() < 6 {
             tokio::time::sleep(Duration::from_millis(5)).await;

@@ -148,7 +148,7 @@ fn image_builder(
         cache_dir: cache,
         cache_bytes: config.push.cache.0,
         bases_dir,
-        imported_dir: home.path().join(bases::IMPORTED),
+        imported_dir: home.path().join(bases::IMPORTED_DIRECTORY),
         build_dir: home.path().join("build"),
         logs_dir: home.path().join("logs"),
         sources: config.archives.sources(),

@@ -326,6 +326,21 @@ fn every_recorded_kind_of_event_is_listed() {
     }
 }
 
+/// A parser of XML takes cubic time for nested namespaces, which `package::xml` refuses before.
+#[test]
+fn xml_is_parsed_in_one_place() {
+    let mut files = Vec::new();
+    for directory in members().keys() {
+        sources(&root().join(directory).join("src"), &mut files);
+    }
+    let parses = |file: &&PathBuf| {
+        let text = std::fs::read_to_string(file).expect("readable");
+        text.contains("roxmltree") && text.contains("Document::parse(")
+    };
+    let found: Vec<&PathBuf> = files.iter().filter(parses).collect();
+    assert_eq!(found, [&root().join("src/package/src/xml.rs")], "use package::xml::parse instead");
+}
+
 /// The code that serde derives for an untagged enum keeps a copy of its input: a recursive one keeps a copy for each
 /// level, so that a short nested text takes all memory. Such a type must be read by a visitor, as
 /// `ros::bus::ParamValue` is.

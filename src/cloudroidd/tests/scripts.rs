@@ -1,4 +1,4 @@
-//! What the scripts of the check do where a part of it misbehaves.
+//! Tests of the check's scripts with parts that misbehave.
 
 use std::path::Path;
 use std::process::{Command, Output};

@@ -58,7 +58,7 @@ pub(crate) fn encode(message: &[u8], layout: &GridLayout, zstd: &mut ZstdCompres
 /// Appends cells of many values.
 fn encode_shades(cells: &[u8], layout: &GridLayout, background: u8, out: &mut Vec<u8>) {
     let values = LadderValues::from_cells(cells, background);
-    if values.count() <= ladder::MOST {
+    if values.count() <= ladder::MAX_VALUES {
         out.extend_from_slice(&[LADDER, background]);
         values.write(out);
         cells::encode(cells, layout, background, LadderModel::new(&values), out);

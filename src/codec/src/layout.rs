@@ -27,8 +27,8 @@ pub enum Schema {
     Other,
 }
 
-/// Known types by name, with the md5 of ROS 1 and the type hash (REP-2016) of ROS 2 Jazzy.
-const KNOWN: [(&str, [&str; 2], Schema); 4] = [
+/// Known types by name, with the md5 of ROS 1 and the type hash (REP-2016) of ROS 2 Jazzy and Kilted.
+const KNOWN_TYPES: [(&str, [&str; 2], Schema); 4] = [
     (
         "sensor_msgs/Image",
         ["060021388200f6f0f447d0fcd9c64743", "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"],
@@ -56,7 +56,7 @@ impl Schema {
     /// with another digest is `Other`.
     pub fn for_type(name: &str, digest: &str) -> Self {
         let name = name.replacen("/msg/", "/", 1);
-        KNOWN
+        KNOWN_TYPES
             .iter()
             .find(|(known, digests, _)| *known == name && digests.contains(&digest))
             .map_or(Self::Other, |&(.., schema)| schema)

@@ -12,8 +12,8 @@ pub(crate) struct Scale {
     factor: f32,
 }
 
-/// From coarse to fine, so that the first one that fits gives the smallest numbers. The position is the name on the
-/// wire: append only.
+/// Scales from coarse to fine, so that the first one that fits gives the smallest numbers. The position is the name on
+/// the wire: append only.
 const SCALES: [(f32, f32); 26] = [
     (1.0, 0.0),
     (2.0, 0.0),

@@ -128,14 +128,14 @@ impl<T: PlaneSample> Wide<T> {
     /// sequence.
     fn choose_predictor(&self, kinds: &[Kind]) -> Kind {
         /// Number of samples of a row to look at.
-        const SOME: usize = 40;
+        const SAMPLES_PER_ROW: usize = 40;
         if let [only] = kinds {
             return *only;
         }
         let rows: usize = self.samples.lanes.iter().map(|plane| plane.height).sum();
         let step = (rows / 32).clamp(1, 16);
         let sequence = self.samples.lanes.first().is_some_and(Padded::is_sequence);
-        let some = if sequence { SOME } else { usize::MAX };
+        let some = if sequence { SAMPLES_PER_ROW } else { usize::MAX };
         let cost = |kind: Kind| -> u64 {
             let mut cost = 0;
             for plane in &self.samples.lanes {

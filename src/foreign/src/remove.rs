@@ -228,14 +228,14 @@ mod tests {
     /// The test runs itself once more in its own mount namespace, where only it sees the mounts.
     #[test]
     fn what_is_mounted_in_a_tree_stays_and_is_named() {
-        const INSIDE: &str = "CLOUDROID_FOREIGN_PLACE";
-        let Some(place) = std::env::var_os(INSIDE) else {
+        const PLACE_VARIABLE: &str = "CLOUDROID_FOREIGN_PLACE";
+        let Some(place) = std::env::var_os(PLACE_VARIABLE) else {
             let place = tempfile::tempdir().expect("a directory");
             let told = Command::new("unshare")
                 .args(["--map-root-user", "--mount"])
                 .arg(std::env::current_exe().expect("this test"))
                 .args(["--exact", "remove::tests::what_is_mounted_in_a_tree_stays_and_is_named"])
-                .env(INSIDE, place.path())
+                .env(PLACE_VARIABLE, place.path())
                 .output()
                 .expect("unshare, of util-linux");
             let said = String::from_utf8_lossy(&told.stdout);

@@ -12,7 +12,7 @@ use rustix::io::Errno;
 use crate::Error;
 
 /// Resolves paths inside the tree only, and through no link.
-pub(crate) const INSIDE: ResolveFlags =
+pub(crate) const INSIDE_TREE: ResolveFlags =
     ResolveFlags::BENEATH.union(ResolveFlags::NO_SYMLINKS).union(ResolveFlags::NO_MAGICLINKS);
 /// Resolves paths inside the tree only, through links that stay in it.
 const FOLLOWING: ResolveFlags = ResolveFlags::BENEATH.union(ResolveFlags::NO_MAGICLINKS);
@@ -80,7 +80,7 @@ impl Tree {
     /// Opens the directory at `path` in this one.
     pub fn open_directory(&self, path: impl AsRef<Path>) -> Result<DirectoryLookup, Error> {
         let shown = self.path.join(path.as_ref());
-        match rustix::fs::openat2(&self.directory, path.as_ref(), DIRECTORY, Mode::empty(), INSIDE) {
+        match rustix::fs::openat2(&self.directory, path.as_ref(), DIRECTORY, Mode::empty(), INSIDE_TREE) {
             Ok(directory) => Ok(DirectoryLookup::Directory(Self { directory, path: shown })),
             Err(Errno::NOENT) => Ok(DirectoryLookup::Nothing),
             Err(error) if is_something_else(error) => Ok(DirectoryLookup::SomethingElse),
@@ -94,7 +94,7 @@ impl Tree {
     /// [`Error::NotAFile`] for anything that is not a regular file or is behind a link, [`Error::Outside`] for a path
     /// that leaves the tree, [`Error::TooLarge`] for a file above the limit, of which no more than the limit is read.
     pub fn read_file(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
-        self.open_and_read(path.as_ref(), limit, INSIDE)
+        self.open_and_read(path.as_ref(), limit, INSIDE_TREE)
     }
 
     /// Returns the names in the directory, without `.` and `..`, unordered.
@@ -107,7 +107,7 @@ impl Tree {
     /// Returns whether a regular file is at `path`, behind no link.
     pub fn has_file(&self, path: impl AsRef<Path>) -> bool {
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-        rustix::fs::openat2(&self.directory, path.as_ref(), flags, Mode::empty(), INSIDE)
+        rustix::fs::openat2(&self.directory, path.as_ref(), flags, Mode::empty(), INSIDE_TREE)
             .and_then(rustix::fs::fstat)
             .is_ok_and(|stat| FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile)
     }
@@ -122,7 +122,7 @@ impl Tree {
     /// # Errors
     /// The same as those of [`Tree::read_file`].
     pub fn open_file(&self, path: impl AsRef<Path>) -> Result<Option<OwnedFd>, Error> {
-        self.open_regular(path.as_ref(), INSIDE)
+        self.open_regular(path.as_ref(), INSIDE_TREE)
     }
 
     /// Opens a file like [`Tree::open_file`], but follows symbolic links that stay in the tree.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{AtFlags, Dir, FileType, Mode, Stat};
 use rustix::io::Errno;
 
-use crate::tree::{DIRECTORY, FILE, INSIDE, is_something_else};
+use crate::tree::{DIRECTORY, FILE, INSIDE_TREE, is_something_else};
 use crate::{Error, cancel};
 
 /// Maximum nesting depth of directories. Each level costs an open file during the walk.
@@ -55,7 +55,7 @@ impl WalkEntry<'_> {
     pub fn open(&self) -> Result<std::fs::File, Error> {
         let failed = |error: Errno| Error::file("open", &self.display_path(), error);
         let flags = if self.kind() == FileType::Directory { DIRECTORY } else { FILE };
-        let file = rustix::fs::openat2(self.parent, self.name, flags, Mode::empty(), INSIDE).map_err(failed)?;
+        let file = rustix::fs::openat2(self.parent, self.name, flags, Mode::empty(), INSIDE_TREE).map_err(failed)?;
         let now = rustix::fs::fstat(&file).map_err(failed)?;
         if (now.st_dev, now.st_ino) != (self.stat.st_dev, self.stat.st_ino) {
             return Err(Error::NotAFile { path: self.display_path() });
@@ -170,7 +170,7 @@ impl<V> Walker<'_, V> {
         if visit == Visit::Skip || entry.kind() != FileType::Directory {
             return Ok(None);
         }
-        match rustix::fs::openat2(parent, name, DIRECTORY, Mode::empty(), INSIDE) {
+        match rustix::fs::openat2(parent, name, DIRECTORY, Mode::empty(), INSIDE_TREE) {
             Ok(directory) => Ok(Some(directory)),
             Err(error) if self.changing && is_something_else(error) => Ok(None),
             Err(error) => Err(Error::file("open", &self.root.join(path), error).into()),

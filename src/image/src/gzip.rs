@@ -125,7 +125,7 @@ impl Write for PieceWriter {
 pub(crate) enum Format {
     Gzip,
     Zstd,
-    /// Anything else is assumed to be tar, whose reader reports errors.
+    /// Assumed to be tar, whose reader reports errors.
     Plain,
 }
 

@@ -24,7 +24,7 @@ pub struct ReceivedImage {
     /// The image in the store, untagged: the same content, with documents written by this store. Its digest equals that
     /// of the layout's image if that was written by such a store, too.
     pub image: Image,
-    /// For each layer, whether it was already in the store.
+    /// Tells for each layer whether it was already in the store.
     pub known: Vec<bool>,
     /// Annotations of the layout's index entry.
     pub annotations: BTreeMap<String, String>,

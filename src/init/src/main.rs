@@ -16,8 +16,8 @@ use init::socket::{self, MAX_FDS};
 use init::wire::{InitReply, InitRequest, MAX_MESSAGE, Scope, Start, StartStage};
 
 /// Exit statuses of init itself.
-const NOT_PID_ONE: c_int = 64;
-const BROKEN: c_int = 70;
+const EXIT_NOT_PID_ONE: c_int = 64;
+const EXIT_BROKEN: c_int = 70;
 
 /// Maximum number of arguments and variables of one program.
 const MAX_STRINGS: usize = 8192;
@@ -40,16 +40,16 @@ extern "C" fn main(_count: c_int, _arguments: *const *const c_char) -> c_int {
     unsafe {
         // `kill(-1)` below must never run among the host's processes.
         if libc::getpid() != 1 {
-            return NOT_PID_ONE;
+            return EXIT_NOT_PID_ONE;
         }
         // Nodes run as the same user: without this they could open init's descriptors through /proc/1/fd.
         libc::prctl(libc::PR_SET_DUMPABLE, 0);
     }
     let (Some(shim), Some(children)) = (take_socket(), watch_children()) else {
-        return BROKEN;
+        return EXIT_BROKEN;
     };
     if !send_reply(shim, InitReply::Ready, &[]) {
-        return BROKEN;
+        return EXIT_BROKEN;
     }
     serve(shim, children);
     // SAFETY: as pid 1 this reaches only the processes of this pid namespace.
@@ -282,7 +282,7 @@ fn supervise(program: libc::pid_t) -> c_int {
     match ended {
         Some(status) if libc::WIFEXITED(status) => libc::WEXITSTATUS(status),
         Some(status) => 128 + libc::WTERMSIG(status),
-        None => BROKEN,
+        None => EXIT_BROKEN,
     }
 }
 

@@ -52,8 +52,8 @@ pub struct ClockFilter {
 }
 
 impl ClockFilter {
-    /// Adds a sample.
-    pub fn add(&mut self, sample: ClockSample) {
+    /// Adds a sample and returns the best one.
+    pub fn add(&mut self, sample: ClockSample) -> ClockSample {
         let disagree = |best: ClockSample| {
             let apart = sample.offset.saturating_sub(best.offset).saturating_abs();
             apart > sample.delay / 2 + best.delay / 2 + DRIFT
@@ -66,6 +66,7 @@ impl ClockFilter {
             self.samples.pop_front();
         }
         self.samples.push_back(sample);
+        self.best().unwrap_or(sample)
     }
 
     /// Returns the sample with the shortest round trip, or `None` before the first pong.

@@ -5,7 +5,7 @@
 //! Lists have a limit on the number of entries, because a list of many small entries takes much more memory than its
 //! JSON text.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use ros::bus::{NodeNames, ParamValue};
 use serde::de::DeserializeOwned;
@@ -58,28 +58,12 @@ pub struct Hello {
 }
 
 impl Hello {
-    /// Returns the size in bytes of all texts and lists except the parameters.
-    pub fn own_bytes(&self) -> usize {
-        let node = &self.node;
-        let texts = [
-            &self.version,
-            &self.run,
-            &self.machine,
-            &self.host,
-            &self.roscore,
-            &node.name,
-            &node.package,
-            &node.executable,
-            &node.namespace,
-            &node.share,
-            &node.directory,
-            &node.image,
-        ];
-        let resume = self.resume.as_ref();
-        let texts = texts.into_iter().chain(&node.argv).chain(&self.codecs);
-        let texts = texts.chain(resume.map(|resume| &resume.session));
-        let ahead = resume.map_or(0, |resume| size_of_val(&resume.ahead[..]));
-        ahead + texts.map(String::len).sum::<usize>()
+    /// Returns the length in bytes of its JSON text without the parameters.
+    pub fn own_bytes(&mut self) -> usize {
+        let parameters = std::mem::take(&mut self.parameters);
+        let json = serde_json::to_vec(self);
+        self.parameters = parameters;
+        json.map_or(0, |json| json.len())
     }
 }
 
@@ -300,32 +284,12 @@ pub(crate) enum SessionMessage {
     },
 }
 
-/// A parsed control record.
-#[derive(Debug, PartialEq)]
-pub(crate) enum Control<O> {
-    /// A message for the user of the session.
-    Order(O),
-    /// A message for the session itself.
-    Between(SessionMessage),
-}
-
 /// Returns the maximum size in bytes of a control record. Parameters may contain long texts, so their limit is higher.
 pub(crate) fn max_control_length(json: &[u8]) -> usize {
     if json.starts_with(b"{\"parameters\"") {
         return MAX_FRAME;
     }
     MAX_CONTROL
-}
-
-impl<O: DeserializeOwned> Control<O> {
-    /// Parses a control record from a peer that sends messages of type `O`.
-    pub(crate) fn read(json: &[u8]) -> serde_json::Result<Self> {
-        // The name comes first in the JSON, so a message of another type is detected immediately.
-        match serde_json::from_slice(json) {
-            Ok(between) => Ok(Self::Between(between)),
-            Err(_) => serde_json::from_slice(json).map(Self::Order),
-        }
-    }
 }
 
 /// The control messages that one end of a session sends.
@@ -380,7 +344,7 @@ pub struct IncompatibleEndpoint {
 
 impl IncompatibleEndpoint {
     /// Maximum number of endpoints reported.
-    pub const MOST: usize = 64;
+    pub const MAX_ENDPOINTS: usize = 64;
 }
 
 /// Exit status of the node.
@@ -459,31 +423,7 @@ pub struct Graph {
     /// Ownership of the above by node name, if the program consists of several nodes (ROS 2). Stubs that do not know
     /// this field attribute everything to their own node.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub nodes: BTreeMap<String, NodeEndpoints>,
-}
-
-/// Names of what one of several nodes owns.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct NodeEndpoints {
-    /// Topics that it publishes.
-    pub outputs: BTreeSet<String>,
-    /// Topics that it subscribes to.
-    pub inputs: BTreeSet<String>,
-    /// Services that it provides.
-    pub services: BTreeSet<String>,
-}
-
-impl From<NodeNames> for NodeEndpoints {
-    fn from(names: NodeNames) -> Self {
-        Self { outputs: names.publishes, inputs: names.subscribes, services: names.serves }
-    }
-}
-
-impl From<NodeEndpoints> for NodeNames {
-    fn from(has: NodeEndpoints) -> Self {
-        Self { publishes: has.outputs, subscribes: has.inputs, serves: has.services }
-    }
+    pub nodes: BTreeMap<String, NodeNames>,
 }
 
 /// A topic that the node publishes.
@@ -581,7 +521,8 @@ mod tests {
         let hello: Hello = serde_json::from_str(hello).unwrap();
         assert_eq!((hello.run.as_str(), hello.machine.as_str()), ("r", "m"));
         assert_eq!((hello.next, hello.attempt), (5, 0));
-        let earlier = LinkLimits { record: 256 << 20, under_way: 256, under_way_bytes: 320 << 20, ahead: 65_536 };
+        let earlier =
+            LinkLimits { record: 256 << 20, under_way: 256, under_way_bytes: 320 << 20, ahead: 65_536, told: 64 << 20 };
         assert_eq!(hello.limits, earlier, "what earlier releases take");
         assert_eq!(hello.resume.unwrap().ahead, [6]);
         assert_eq!((hello.node.name.as_str(), hello.sla.max), ("/n", Some(0.3)));
@@ -642,15 +583,20 @@ mod tests {
 
     #[test]
     fn session_messages_are_distinguished_from_control_messages() {
-        let asked = Control::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
-        assert_eq!(asked, Control::Between(SessionMessage::Keyframe { channel: 7 }));
         // Whitespace does not matter.
-        let asked = Control::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
-        assert_eq!(asked, Control::Between(SessionMessage::Keyframe { channel: 7 }));
-        let order = Control::read(br#"{"signal":{"signal":9}}"#).unwrap();
-        assert_eq!(order, Control::Order(FromRobot::Signal { signal: 9 }));
+        for asked in [r#"{"keyframe":{"channel":7}}"#, " { \"keyframe\" : { \"channel\" : 7 } }"] {
+            let message: SessionMessage = serde_json::from_str(asked).unwrap();
+            assert_eq!(message, SessionMessage::Keyframe { channel: 7 });
+            assert!(serde_json::from_str::<FromRobot>(asked).is_err());
+            assert!(serde_json::from_str::<FromCloud>(asked).is_err());
+        }
+        let order = r#"{"signal":{"signal":9}}"#;
+        assert_eq!(serde_json::from_str::<FromRobot>(order).unwrap(), FromRobot::Signal { signal: 9 });
+        for unknown in [order, r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
+            assert!(serde_json::from_str::<SessionMessage>(unknown).is_err(), "{unknown}");
+        }
         for unknown in [r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
-            assert!(Control::<FromRobot>::read(unknown.as_bytes()).is_err(), "{unknown}");
+            assert!(serde_json::from_str::<FromRobot>(unknown).is_err(), "{unknown}");
         }
     }
 

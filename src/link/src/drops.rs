@@ -16,7 +16,7 @@ pub enum Cause {
     Replaced,
     /// Older than T_max while a newer message was waiting.
     Stale,
-    /// Too big for the retransmit buffer and in flight when a connection was lost.
+    /// The message was too big for the retransmit buffer, and in flight when a connection was lost.
     CutOff,
     /// The queue in front of the link was full.
     Busy,
@@ -60,15 +60,6 @@ impl Cause {
     }
 }
 
-/// Numbers of messages that were intentionally not sent.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct SkipCounts {
-    /// Number of messages replaced by a newer one.
-    pub replaced: u64,
-    /// Number of messages that had become too old.
-    pub stale: u64,
-}
-
 /// Number of messages of a topic dropped for one cause.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicDropCount {
@@ -90,54 +81,33 @@ impl fmt::Display for TopicDropCount {
     }
 }
 
-/// An external counter. Returns its value and whether it is final.
-type Counter = Box<dyn Fn() -> (u64, bool) + Send + Sync>;
-
+/// An external counter.
 struct WatchedCounter {
     topic: String,
     cause: Cause,
     seen: u64,
-    counter: Counter,
+    /// Returns its value and whether it is final.
+    counter: Box<dyn Fn() -> (u64, bool) + Send + Sync>,
 }
 
 /// Number of dropped messages by key `K` (a topic or a channel) and cause.
-#[derive(Debug, Clone)]
-pub(crate) struct Tally<K>(BTreeMap<(K, Cause), u64>);
-
-impl<K> Default for Tally<K> {
-    fn default() -> Self {
-        Self(BTreeMap::new())
-    }
-}
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Tally<K>(BTreeMap<K, BTreeMap<Cause, u64>>);
 
 impl<K: Ord> Tally<K> {
     pub(crate) fn add(&mut self, of: K, cause: Cause, count: u64) {
         if count > 0 {
-            *self.0.entry((of, cause)).or_default() += count;
+            *self.0.entry(of).or_default().entry(cause).or_default() += count;
         }
     }
 
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&K, Cause, u64)> {
-        let all = self.0.iter();
-        all.map(|((of, cause), count)| (of, *cause, *count))
-    }
-
-    /// Returns the number of messages dropped for this cause.
-    pub(crate) fn count_for(&self, cause: Cause) -> u64 {
-        let all = self.iter().filter(|(_, why, _)| *why == cause);
-        all.map(|(_, _, count)| count).sum()
+        self.0.iter().flat_map(|(of, counts)| counts.iter().map(move |(cause, count)| (of, *cause, *count)))
     }
 
     /// Removes the counts of a key and returns them.
-    pub(crate) fn take(&mut self, of: &K) -> Vec<(Cause, u64)> {
-        let mut taken = Vec::new();
-        self.0.retain(|(known, cause), count| {
-            if known == of {
-                taken.push((*cause, *count));
-            }
-            known != of
-        });
-        taken
+    pub(crate) fn take(&mut self, of: &K) -> BTreeMap<Cause, u64> {
+        self.0.remove(of).unwrap_or_default()
     }
 }
 
@@ -172,12 +142,8 @@ impl DropCounters {
 
     /// Includes the value returned by `counter` until it reports that its value is final.
     pub fn watch_with(&self, topic: &str, cause: Cause, counter: impl Fn() -> (u64, bool) + Send + Sync + 'static) {
-        self.watched.lock().push(WatchedCounter {
-            topic: topic.to_owned(),
-            cause,
-            seen: 0,
-            counter: Box::new(counter),
-        });
+        let (topic, counter) = (topic.to_owned(), Box::new(counter));
+        self.watched.lock().push(WatchedCounter { topic, cause, seen: 0, counter });
     }
 
     /// Returns all counts so far.
@@ -201,15 +167,13 @@ pub struct DropReporter {
 impl DropReporter {
     /// Returns the drops to report now and marks them as reported.
     pub fn take_new(&mut self, all: &[TopicDropCount]) -> Vec<TopicDropCount> {
-        let mut news = Vec::new();
-        for drop in all {
+        let mut is_new = |drop: &TopicDropCount| {
             let told = self.told.entry((drop.topic.clone(), drop.cause)).or_default();
-            if drop.count >= told.saturating_mul(10).max(1) {
-                *told = drop.count;
-                news.push(drop.clone());
-            }
-        }
-        news
+            let is_new = drop.count >= told.saturating_mul(10).max(1);
+            *told = if is_new { drop.count } else { *told };
+            is_new
+        };
+        all.iter().filter(|drop| is_new(drop)).cloned().collect()
     }
 }
 

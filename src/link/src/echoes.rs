@@ -8,7 +8,7 @@ use ros::bus::ParamValue;
 
 /// Number of values remembered per parameter. If a parameter is set more often than this before the first change is
 /// reported, its last values are echoed.
-const REMEMBERED: usize = 64;
+const MAX_STAMPS: usize = 64;
 
 /// Parameter values that were set on behalf of the other end and whose changes may still be reported, in order. Only
 /// hashes of the values are kept, because all parameters of a robot may be among them.
@@ -25,7 +25,7 @@ impl Echoes {
         let mut set = self.set.lock();
         let values = set.entry(key.to_owned()).or_default();
         if values.back() != Some(&hash) {
-            if values.len() == REMEMBERED {
+            if values.len() == MAX_STAMPS {
                 values.pop_front();
             }
             values.push_back(hash);
@@ -83,7 +83,7 @@ mod tests {
         for number in 0..1000 {
             echoes.expect("/a", &ParamValue::Int(number));
         }
-        assert_eq!(echoes.set.lock()["/a"].len(), REMEMBERED);
+        assert_eq!(echoes.set.lock()["/a"].len(), MAX_STAMPS);
         assert!(echoes.is_echo("/a", Some(&ParamValue::Int(999))));
         echoes.expect("/a", &one);
         echoes.forget("/a");

@@ -16,7 +16,7 @@
 //! value. `bytes` is the total number of bytes received, from which the sender computes the throughput of the link.
 //! Times are nanoseconds since the Unix epoch on the clock of the end that wrote them.
 
-use bytes::{Buf, BufMut, Bytes, BytesMut};
+use bytes::{Buf, BufMut, Bytes, BytesMut, TryGetError};
 
 use crate::Error;
 
@@ -103,30 +103,36 @@ impl ReceiveProgress {
         out.put_u64_le(self.bytes);
     }
 
-    fn get(bytes: &mut Bytes) -> Self {
-        Self { number: bytes.get_u64_le(), bytes: bytes.get_u64_le() }
+    fn get(bytes: &mut Bytes) -> Result<Self, TryGetError> {
+        Ok(Self { number: bytes.try_get_u64_le()?, bytes: bytes.try_get_u64_le()? })
     }
 }
 
 impl Frame {
     /// Encodes the frame as a WebSocket message.
     pub fn encode(&self) -> Bytes {
-        let mut out = BytesMut::with_capacity(40 + self.payload().map_or(0, Bytes::len));
+        let mut out = BytesMut::with_capacity(64);
         match self {
-            Frame::Open(_) => out.put_u8(OPEN),
-            Frame::Whole { number, .. } => {
+            Frame::Open(json) => {
+                out.put_u8(OPEN);
+                out.put_slice(json);
+            }
+            Frame::Whole { number, record } => {
                 out.put_u8(WHOLE);
                 out.put_u64_le(*number);
+                out.put_slice(record);
             }
-            Frame::Begin { stream, number, total, .. } => {
+            Frame::Begin { stream, number, total, bytes } => {
                 out.put_u8(BEGIN);
                 out.put_u32_le(*stream);
                 out.put_u64_le(*number);
                 out.put_u32_le(*total);
+                out.put_slice(bytes);
             }
-            Frame::More { stream, .. } => {
+            Frame::More { stream, bytes } => {
                 out.put_u8(MORE);
                 out.put_u32_le(*stream);
+                out.put_slice(bytes);
             }
             Frame::Ping { sent, received } => {
                 out.put_u8(PING);
@@ -150,61 +156,31 @@ impl Frame {
                 out.put_i64_le(*born);
             }
         }
-        if let Some(payload) = self.payload() {
-            out.put_slice(payload);
-        }
         out.freeze()
-    }
-
-    fn payload(&self) -> Option<&Bytes> {
-        match self {
-            Frame::Open(bytes)
-            | Frame::Whole { record: bytes, .. }
-            | Frame::Begin { bytes, .. }
-            | Frame::More { bytes, .. } => Some(bytes),
-            _ => None,
-        }
     }
 
     /// Decodes a WebSocket message. Payloads are slices of it, not copies.
     pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
-        let Some(&kind) = bytes.first() else {
-            return Err(Error::Protocol("an empty frame"));
-        };
-        let head = match kind {
-            OPEN => 1,
-            WHOLE => 9,
-            MORE => 5,
-            BEGIN => 17,
-            PING => 25,
-            PONG => 41,
-            ACK => 17,
-            DAMAGED => 13,
-            _ => return Err(Error::Protocol("a frame of unknown kind")),
-        };
-        if bytes.len() < head {
-            return Err(Error::Protocol("a frame that ends in its head"));
-        }
-        bytes.advance(1);
-        Ok(match kind {
+        Ok(match bytes.try_get_u8()? {
             OPEN => Frame::Open(bytes),
-            WHOLE => Frame::Whole { number: bytes.get_u64_le(), record: bytes },
+            WHOLE => Frame::Whole { number: bytes.try_get_u64_le()?, record: bytes },
             BEGIN => Frame::Begin {
-                stream: bytes.get_u32_le(),
-                number: bytes.get_u64_le(),
-                total: bytes.get_u32_le(),
+                stream: bytes.try_get_u32_le()?,
+                number: bytes.try_get_u64_le()?,
+                total: bytes.try_get_u32_le()?,
                 bytes,
             },
-            MORE => Frame::More { stream: bytes.get_u32_le(), bytes },
-            PING => Frame::Ping { sent: bytes.get_i64_le(), received: ReceiveProgress::get(&mut bytes) },
+            MORE => Frame::More { stream: bytes.try_get_u32_le()?, bytes },
+            PING => Frame::Ping { sent: bytes.try_get_i64_le()?, received: ReceiveProgress::get(&mut bytes)? },
             PONG => Frame::Pong {
-                sent: bytes.get_i64_le(),
-                arrived: bytes.get_i64_le(),
-                left: bytes.get_i64_le(),
-                received: ReceiveProgress::get(&mut bytes),
+                sent: bytes.try_get_i64_le()?,
+                arrived: bytes.try_get_i64_le()?,
+                left: bytes.try_get_i64_le()?,
+                received: ReceiveProgress::get(&mut bytes)?,
             },
-            ACK => Frame::Ack(ReceiveProgress::get(&mut bytes)),
-            _ => Frame::Damaged { channel: bytes.get_u32_le(), born: bytes.get_i64_le() },
+            ACK => Frame::Ack(ReceiveProgress::get(&mut bytes)?),
+            DAMAGED => Frame::Damaged { channel: bytes.try_get_u32_le()?, born: bytes.try_get_i64_le()? },
+            _ => return Err(Error::Protocol("a frame of unknown kind")),
         })
     }
 }

@@ -1,5 +1,6 @@
 //! Reassembly of records from frames: joins pieces, drops duplicates and tracks what was received. No I/O.
 
+use std::collections::hash_map::Entry;
 use std::collections::{BTreeSet, HashMap};
 
 use budget::{Budget, Permit};
@@ -13,49 +14,30 @@ use crate::{Error, LinkLimits, MAX_FRAME};
 const READ_AHEAD: usize = 1 << 20;
 
 /// Receive state of a session.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Incoming {
-    /// Budget for incomplete records.
-    budget: Budget,
+    /// Budget for incomplete records; `None`: without a limit.
+    pub(crate) budget: Option<Budget>,
     number: u64,
     ahead: BTreeSet<u64>,
     /// The first number on this connection, until the peer uses it and thereby shows that it knows what was received.
     next: Option<u64>,
     bytes: u64,
-    streams: HashMap<u32, Partial>,
-    partial: usize,
+    pub(crate) streams: HashMap<u32, Partial>,
+    /// Total length of the incomplete records.
+    pub(crate) partial: usize,
     pub(crate) limits: LinkLimits,
 }
 
 #[derive(Debug)]
-struct Partial {
+pub(crate) struct Partial {
     number: u64,
     total: usize,
     bytes: BytesMut,
-    permit: Permit,
-}
-
-impl Default for Incoming {
-    fn default() -> Self {
-        Self::with_budget(&Budget::without_limit())
-    }
+    permit: Option<Permit>,
 }
 
 impl Incoming {
-    /// Creates an empty state whose incomplete records are charged to `budget`.
-    pub(crate) fn with_budget(budget: &Budget) -> Self {
-        Self {
-            budget: budget.clone(),
-            number: 0,
-            ahead: BTreeSet::new(),
-            next: None,
-            bytes: 0,
-            streams: HashMap::new(),
-            partial: 0,
-            limits: LinkLimits::default(),
-        }
-    }
-
     /// Returns the number up to which all records have been received, and the received numbers beyond it.
     pub(crate) fn received_numbers(&self) -> (u64, Vec<u64>) {
         (self.number, self.ahead.iter().copied().collect())
@@ -68,12 +50,6 @@ impl Incoming {
     /// Returns whether a record is incomplete.
     pub(crate) fn is_receiving(&self) -> bool {
         !self.streams.is_empty()
-    }
-
-    /// Returns the number of incomplete records and the sum of their lengths.
-    #[cfg(test)]
-    pub(crate) fn in_flight(&self) -> (usize, usize) {
-        (self.streams.len(), self.partial)
     }
 
     /// Begins a new connection on which the peer's numbers start at `next`. Incomplete records must be sent again: the
@@ -101,34 +77,28 @@ impl Incoming {
     ) -> Result<Option<Bytes>, Error> {
         let total = total as usize;
         let limits = self.limits;
-        if total > limits.record {
-            return Err(limit_error("a record", total, limits.record));
+        check_limit("a record", total, limits.record)?;
+        if is_control(bytes) {
+            check_limit("a control record", total, MAX_FRAME)?;
         }
-        if is_control(bytes) && total > MAX_FRAME {
-            return Err(limit_error("a control record", total, MAX_FRAME));
-        }
-        let under_way = self.streams.len();
-        if under_way >= limits.under_way {
-            return Err(limit_error("records under way", under_way, limits.under_way));
-        }
+        check_limit("records under way", self.streams.len() + 1, limits.under_way)?;
         if bytes.len() > total || self.streams.contains_key(&stream) {
             return Err(Error::Protocol("a record that begins twice or is too long"));
         }
         self.partial += total;
-        if self.partial > limits.under_way_bytes {
-            let limit = limits.under_way_bytes;
-            return Err(limit_error("records under way", self.partial, limit));
-        }
-        let partial = Partial { number, total, bytes: BytesMut::new(), permit: self.budget.permit() };
+        check_limit("records under way", self.partial, limits.under_way_bytes)?;
+        let partial =
+            Partial { number, total, bytes: BytesMut::new(), permit: self.budget.as_ref().map(Budget::permit) };
         self.streams.insert(stream, partial);
         self.receive_more(stream, bytes)
     }
 
     /// Receives the next piece; returns the record once it is complete.
     pub(crate) fn receive_more(&mut self, stream: u32, bytes: &[u8]) -> Result<Option<Bytes>, Error> {
-        let Some(partial) = self.streams.get_mut(&stream) else {
+        let Entry::Occupied(mut entry) = self.streams.entry(stream) else {
             return Err(Error::Protocol("more of a record that did not begin"));
         };
+        let partial = entry.get_mut();
         self.bytes += bytes.len() as u64;
         if partial.bytes.len() + bytes.len() > partial.total {
             return Err(Error::Protocol("a record longer than it said"));
@@ -138,16 +108,14 @@ impl Incoming {
             // Memory grows with what is received, not with the announced length.
             let room = partial.bytes.len().max(READ_AHEAD).max(bytes.len());
             let room = room.min(missing);
-            partial.permit.grow_to(partial.bytes.len() + room)?;
+            partial.permit.as_mut().map_or(Ok(()), |permit| permit.grow_to(partial.bytes.len() + room))?;
             partial.bytes.reserve(room);
         }
         partial.bytes.extend_from_slice(bytes);
         if partial.bytes.len() < partial.total {
             return Ok(None);
         }
-        let Some(whole) = self.streams.remove(&stream) else {
-            return Ok(None);
-        };
+        let whole = entry.remove();
         self.partial -= whole.total;
         Ok(self.note_number(whole.number)?.then(|| whole.bytes.freeze()))
     }
@@ -166,21 +134,22 @@ impl Incoming {
         }
         if number == self.number.wrapping_add(1) {
             self.number = number;
-            while self.ahead.remove(&self.number.wrapping_add(1)) {
-                self.number = self.number.wrapping_add(1);
-            }
-            return Ok(true);
+        } else {
+            check_limit("numbers ahead", self.ahead.len() + 1, self.limits.ahead)?;
+            self.ahead.insert(number);
         }
-        if self.ahead.len() >= self.limits.ahead {
-            return Err(limit_error("numbers ahead", self.ahead.len(), self.limits.ahead));
+        while self.ahead.remove(&self.number.wrapping_add(1)) {
+            self.number = self.number.wrapping_add(1);
         }
-        self.ahead.insert(number);
         Ok(true)
     }
 }
 
-pub(crate) fn limit_error(what: &'static str, bytes: usize, limit: usize) -> Error {
-    Error::TooMuch { what, bytes: bytes as u64, limit: limit as u64 }
+pub(crate) fn check_limit(what: &'static str, bytes: usize, limit: usize) -> Result<(), Error> {
+    if bytes > limit {
+        return Err(Error::TooMuch { what, bytes: bytes as u64, limit: limit as u64 });
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -190,7 +159,7 @@ mod tests {
     #[test]
     fn incomplete_records_stay_within_their_budget() {
         let budget = Budget::new("servant x", 4 << 20);
-        let mut incoming = Incoming::with_budget(&budget);
+        let mut incoming = Incoming { budget: Some(budget.clone()), ..Incoming::default() };
         // Announced lengths cost little memory.
         for stream in 0..2 {
             let begun = incoming.receive_begin(stream, u64::from(stream) + 1, 100 << 20, b"x");
@@ -208,7 +177,7 @@ mod tests {
     #[test]
     fn a_complete_record_releases_its_budget() {
         let budget = Budget::new("servant x", 3 << 20);
-        let mut incoming = Incoming::with_budget(&budget);
+        let mut incoming = Incoming { budget: Some(budget.clone()), ..Incoming::default() };
         let begun = incoming.receive_begin(1, 1, 1000, &[7; 400]).expect("there is room");
         assert!(begun.is_none() && budget.used_bytes() == 1000);
         let whole = incoming.receive_more(1, &[7; 600]).expect("there is room");

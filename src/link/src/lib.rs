@@ -22,7 +22,7 @@
 mod bounded;
 pub mod clock;
 pub mod control;
-mod declared;
+mod declared_types;
 pub mod drops;
 mod echoes;
 pub mod frame;
@@ -37,7 +37,6 @@ pub mod session;
 pub mod skew;
 mod values;
 
-pub use drops::SkipCounts;
 pub use echoes::Echoes;
 pub use limits::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 pub use outgoing::DeliveryMode;
@@ -64,6 +63,9 @@ pub enum Error {
     /// Invalid data.
     #[error("the other end broke the protocol: {0}")]
     Protocol(&'static str),
+    /// Data shorter than its header.
+    #[error("the other end broke the protocol: a frame or record that ends in its head")]
+    Cut(#[from] bytes::TryGetError),
     /// A size limit was exceeded.
     #[error("the other end sends {what} of {bytes} bytes, more than the limit of {limit}")]
     TooMuch {

@@ -20,12 +20,12 @@ mod data;
 mod encoding;
 mod gate;
 mod lanes;
-mod out;
+mod outgoing_record;
 mod retransmit;
 
 use std::collections::{BTreeMap, VecDeque};
 
-use ::budget::{Budget, Permit};
+use ::budget::Permit;
 use ros::ring::{Ring, RingItem};
 use ros::turns::RoundRobin;
 
@@ -34,11 +34,10 @@ use crate::frame::Frame;
 use crate::limits::LinkLimits;
 use crate::record::{LEFT_AT, Record};
 use encoding::Encoding;
-use gate::Gate;
-use lanes::{LineQueue, RecordLane, RecordLanes};
-pub use out::DeliveryMode;
-use out::{InFlightRecord, OutgoingRecord, SMALL};
-use retransmit::RetransmitBuffer;
+use lanes::{RecordLane, RecordLanes};
+pub use outgoing_record::DeliveryMode;
+use outgoing_record::{InFlightRecord, OutgoingRecord, SMALL};
+use retransmit::SentRecord;
 
 /// Target transmission time of a piece at the measured throughput, in seconds.
 const PIECE_TIME: f64 = 0.008;
@@ -57,9 +56,10 @@ const TURN_OF_DATA: u32 = 4;
 const UNKEPT_AHEAD: usize = 4;
 
 /// Send state of a session.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Outgoing {
-    next_number: u64,
+    /// The last record number in use.
+    numbered: u64,
     /// The peer has acknowledged all numbers up to this one.
     acknowledged: u64,
     next_stream: u32,
@@ -67,22 +67,24 @@ pub(crate) struct Outgoing {
     /// Limits of the peer.
     peer: LinkLimits,
     lanes: RecordLanes,
-    lines: LineQueue,
-    topics: BTreeMap<u32, Ring<OutgoingRecord>>,
-    /// By channel: the last control record that was pushed before its first message.
+    pub(crate) topics: BTreeMap<u32, Ring<OutgoingRecord>>,
+    /// Number of the last control record that was pushed before each channel's first message.
     openings: BTreeMap<u32, u64>,
-    /// Topics with something to send. A topic whose big message is in flight or being encoded is held.
+    /// Topics with something to send, perhaps after a message that is in flight or being encoded.
     turns: RoundRobin<u32>,
     sending: VecDeque<InFlightRecord>,
-    retransmit: RetransmitBuffer,
-    /// Memory permit for everything queued and kept, except for the last `uncounted` bytes.
-    permit: Permit,
+    /// Records that were sent and not yet acknowledged, by number.
+    retransmit: VecDeque<SentRecord>,
+    /// Memory permit for everything queued and kept, except for the last `uncounted` bytes; `None`: without a limit.
+    pub(crate) permit: Option<Permit>,
     uncounted: usize,
-    /// Why the session must be closed.
-    full: Option<String>,
+    /// Reason to close the session: more is queued than allowed, because the peer does not receive what it must, or
+    /// does not acknowledge it.
+    pub(crate) overflow_reason: Option<String>,
     in_a_row: u32,
     pub(crate) encoding: Encoding,
-    piece: usize,
+    /// Size of a piece, once the throughput was measured.
+    piece: Option<usize>,
     max_age: Option<i64>,
     /// Dropped messages by channel.
     pub(crate) dropped: Tally<u32>,
@@ -94,41 +96,7 @@ pub(crate) struct Outgoing {
 
 impl Outgoing {
     pub(crate) fn new(max_age: Option<i64>) -> Self {
-        Self {
-            next_number: 1,
-            acknowledged: 0,
-            next_stream: 0,
-            next_order: 0,
-            peer: LinkLimits::default(),
-            lanes: RecordLanes::default(),
-            lines: LineQueue::default(),
-            topics: BTreeMap::new(),
-            openings: BTreeMap::new(),
-            turns: RoundRobin::default(),
-            sending: VecDeque::new(),
-            retransmit: RetransmitBuffer::default(),
-            permit: Budget::without_limit().permit(),
-            uncounted: 0,
-            full: None,
-            in_a_row: 0,
-            encoding: Encoding::default(),
-            piece: FIRST_PIECE,
-            max_age,
-            dropped: Tally::default(),
-            closed: Vec::new(),
-            sent: 0,
-        }
-    }
-
-    /// Charges what is queued and kept to `budget`. Messages and lines that do not fit are dropped; a control message,
-    /// call or response that does not fit ends the session.
-    pub(crate) fn set_budget(&mut self, budget: &Budget) {
-        self.permit = budget.permit();
-    }
-
-    /// Returns why more is queued than allowed: the peer does not receive what it must, or does not acknowledge it.
-    pub(crate) fn overflow_reason(&self) -> Option<&str> {
-        self.full.as_deref()
+        Self { max_age, ..Self::default() }
     }
 
     /// Sets the limits announced by the peer.
@@ -136,10 +104,15 @@ impl Outgoing {
         self.peer = peer.with_minimums();
     }
 
+    /// Returns the limits of the peer.
+    pub(crate) fn peer_limits(&self) -> LinkLimits {
+        self.peer
+    }
+
     /// Marks a channel as announced by the control record pushed before: no message of the channel is sent earlier.
     pub(crate) fn open_channel(&mut self, channel: u32) {
         self.order_after_control(channel);
-        self.encoding.add(channel);
+        self.encoding.channels.insert(channel);
     }
 
     /// Makes messages of a channel wait for the control records pushed before.
@@ -152,7 +125,7 @@ impl Outgoing {
             Record::Control(_) => RecordLane::Control,
             Record::Answer { .. } => RecordLane::Answers,
             Record::Data(_) if quality != DeliveryMode::InOrder => RecordLane::Data,
-            Record::Data(_) | Record::Call { .. } => RecordLane::Calls,
+            Record::Data(_) | Record::Call(_) => RecordLane::Calls,
         };
         let mut out = self.assign_order(OutgoingRecord::new(record, lane));
         out.each = quality != DeliveryMode::Newest;
@@ -176,19 +149,27 @@ impl Outgoing {
     /// Queues a line printed by a node; it is sent when there is spare capacity.
     pub(crate) fn push_line(&mut self, line: &Record) {
         let line = self.assign_order(OutgoingRecord::new(line, RecordLane::Lines));
-        self.lines.push(line);
+        self.lanes.push_line(line);
+    }
+
+    /// Queues the last control message, and ahead of it the newest lines, which say why it is the last one.
+    pub(crate) fn push_last(&mut self, record: &Record) {
+        for line in self.lanes.take_last_lines() {
+            let line = self.assign_order(OutgoingRecord { lane: RecordLane::Control, ..line });
+            self.push_required(line);
+        }
+        self.push(record, DeliveryMode::Each);
     }
 
     fn assign_order(&mut self, out: OutgoingRecord) -> OutgoingRecord {
         self.next_order += 1;
-        let order = self.next_order;
-        OutgoingRecord { order, ..out }
+        OutgoingRecord { order: self.next_order, ..out }
     }
 
     /// Queues a record that must be delivered. A control message, call or response beyond the limits ends the session,
     /// because omitting it would lose it.
     fn push_required(&mut self, out: OutgoingRecord) {
-        if self.full.is_some() {
+        if self.overflow_reason.is_some() {
             return;
         }
         let bytes = out.memory_size();
@@ -197,32 +178,21 @@ impl Outgoing {
         match (refused, out.channel) {
             (None, _) => self.lanes.push(out),
             (Some(_), Some(channel)) => self.dropped.add(channel, Cause::Full, 1),
-            (refused, None) => self.full = refused,
+            (refused, None) => self.overflow_reason = refused,
         }
     }
 
     /// Returns whether the socket has been given everything that can be sent.
     pub(crate) fn is_idle(&self) -> bool {
         self.lanes.is_empty()
-            && self.lines.is_empty()
             && self.sending.is_empty()
-            && !self.encoding.has_encoded()
-            && (self.turns.is_empty() || self.encoding.is_busy())
+            && self.encoding.encoded_message().is_none()
+            && (self.turns.is_empty() || self.encoding.message().is_some())
     }
 
     /// Returns whether nothing is queued.
     pub(crate) fn is_empty(&self) -> bool {
-        self.lanes.is_empty()
-            && self.lines.is_empty()
-            && self.turns.is_empty()
-            && self.sending.is_empty()
-            && self.encoding.is_empty()
-    }
-
-    /// Returns the number of messages queued on each topic.
-    #[cfg(test)]
-    pub(crate) fn queue_lengths(&self) -> impl Iterator<Item = usize> {
-        self.topics.values().map(Ring::len)
+        self.lanes.is_empty() && self.turns.is_empty() && self.sending.is_empty() && self.encoding.message().is_none()
     }
 
     /// Returns the next frame to send.
@@ -241,28 +211,34 @@ impl Outgoing {
             return Some(self.start(out, now));
         }
         self.in_a_row = 0;
-        if let Some(piece) = self.next_piece() {
-            return Some(piece);
-        }
-        let line = self.next_line(true)?;
-        Some(self.start(line, now))
+        self.next_piece().or_else(|| {
+            let line = self.next_line(true)?;
+            Some(self.start(line, now))
+        })
     }
 
     fn next_line(&mut self, is_alone: bool) -> Option<OutgoingRecord> {
-        let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
-        self.lines.take(is_alone, |out| gate.allows(out))
+        let first = self.lanes.records_of(RecordLane::Lines).next()?;
+        // A line that is not kept must be missed if it is lost.
+        let is_numbered = self.has_spare_numbers() || self.should_keep(first);
+        let may = is_numbered && self.allows(first);
+        may.then(|| self.lanes.take_line(is_alone)).flatten()
+    }
+
+    /// Returns whether records may have a number that are not kept for retransmission.
+    fn has_spare_numbers(&self) -> bool {
+        self.unacknowledged_count() < self.peer.ahead / UNKEPT_AHEAD
     }
 
     /// Returns the number of record numbers in use that the peer has not acknowledged.
     pub(crate) fn unacknowledged_count(&self) -> usize {
-        usize::try_from(self.next_number - 1 - self.acknowledged).unwrap_or(usize::MAX)
+        usize::try_from(self.numbered - self.acknowledged).unwrap_or(usize::MAX)
     }
 
     fn next_record(&mut self, now: i64) -> Option<OutgoingRecord> {
         let is_turn_of_data = self.in_a_row % TURN_OF_DATA == TURN_OF_DATA - 1;
         let data = if is_turn_of_data { self.next_data(now) } else { None };
-        let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
-        let place = data.is_none().then(|| self.lanes.first_ready(|out| gate.allows(out)));
+        let place = data.is_none().then(|| self.lanes.first_ready(|out| self.allows(out)));
         let required = place.flatten().and_then(|lane| self.lanes.take(lane));
         data.or(required).or_else(|| self.next_data(now))
     }
@@ -272,53 +248,43 @@ impl Outgoing {
             out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
         }
         let length = out.len();
-        let again = self.retransmit.should_keep(&out);
-        let number = if again || self.unacknowledged_count() < self.peer.ahead / UNKEPT_AHEAD {
-            self.next_number += 1;
-            self.next_number - 1
-        } else {
-            0
-        };
-        if length <= SMALL {
-            self.end_turn(&out);
+        let again = self.should_keep(&out);
+        let is_numbered = again || self.has_spare_numbers();
+        self.numbered += u64::from(is_numbered);
+        let number = if is_numbered { self.numbered } else { 0 };
+        if self.fits_one_frame(&out) {
             let record = out.piece(0, length);
             self.count_sent(out.lane, length);
-            self.retransmit.add(number, again, out);
+            self.note_sent(number, again, out);
             return Frame::Whole { number, record };
-        }
-        // The topic is held until the message has been sent completely.
-        if let Some(channel) = out.channel.filter(|_| out.lane == RecordLane::Data) {
-            self.turns.hold(channel);
         }
         let stream = self.next_stream;
         self.next_stream = self.next_stream.wrapping_add(1);
         // On a fast link a piece may be longer than the record; the rest must not be empty.
-        let bytes = out.piece(0, self.piece.min(length - 1));
+        let bytes = out.piece(0, self.piece().min(length - 1));
         self.count_sent(out.lane, bytes.len());
         let total = u32::try_from(length).unwrap_or(u32::MAX);
-        let at = bytes.len();
-        self.sending.push_back(InFlightRecord { stream, number, again, at, out });
+        self.sending.push_back(InFlightRecord { stream, number, again, at: bytes.len(), out });
         Frame::Begin { stream, number, total, bytes }
     }
 
     fn count_sent(&mut self, lane: RecordLane, bytes: usize) {
         self.sent += bytes as u64;
         if lane != RecordLane::Lines {
-            self.lines.earn_credit(bytes);
+            self.lanes.earn_credit(bytes);
         }
     }
 
     fn next_piece(&mut self) -> Option<Frame> {
         let mut sending = self.sending.pop_front()?;
-        let bytes = sending.out.piece(sending.at, self.piece);
+        let bytes = sending.out.piece(sending.at, self.piece());
         sending.at += bytes.len();
         self.count_sent(sending.out.lane, bytes.len());
         let stream = sending.stream;
         if sending.at < sending.out.len() {
             self.sending.push_back(sending);
         } else {
-            self.end_turn(&sending.out);
-            self.retransmit.add(sending.number, sending.again, sending.out);
+            self.note_sent(sending.number, sending.again, sending.out);
         }
         Some(Frame::More { stream, bytes })
     }
@@ -326,23 +292,34 @@ impl Outgoing {
     /// Sets the size of pieces for a link with this throughput.
     pub(crate) fn set_throughput(&mut self, bytes_per_second: f64) {
         let piece = (bytes_per_second * PIECE_TIME) as usize;
-        self.piece = piece.clamp(PIECES.0, PIECES.1);
+        self.piece = Some(piece.clamp(PIECES.0, PIECES.1));
+    }
+
+    /// Returns whether a record is sent in one frame: a short one, but on a slow link no message for which others would
+    /// wait much longer than for a piece.
+    fn fits_one_frame(&self, out: &OutgoingRecord) -> bool {
+        let longest = if out.lane == RecordLane::Data && !out.closes { SMALL.min(2 * self.piece()) } else { SMALL };
+        out.len() <= longest
+    }
+
+    fn piece(&self) -> usize {
+        self.piece.unwrap_or(FIRST_PIECE)
     }
 
     /// Returns the level in bytes below which the socket buffer is refilled; a small message waits for what is in it.
     pub(crate) fn low_water(&self) -> usize {
-        LOW_WATER.min(2 * self.piece)
+        LOW_WATER.min(2 * self.piece())
     }
 
     /// Starts numbering at this number, which was announced to the peer.
     pub(crate) fn begin_at(&mut self, number: u64) {
-        self.next_number = number.max(1);
-        self.acknowledged = self.next_number - 1;
+        self.numbered = number.saturating_sub(1);
+        self.acknowledged = self.numbered;
     }
 
     /// Returns the first number of the next connection.
     pub(crate) fn next_number(&self) -> u64 {
-        self.next_number
+        self.numbered + 1
     }
 }
 

@@ -45,29 +45,12 @@ struct TopicEncoder {
     begin_anew: bool,
 }
 
-/// A message to be encoded together with its encoder; it is encoded on another thread.
-pub(crate) struct EncodeJob {
-    channel: u32,
-    sender: Sender,
-    message: Bytes,
-}
-
 /// The result of encoding a message.
 pub(crate) struct EncodedMessage {
     channel: u32,
     sender: Sender,
-    pub(crate) frame: Bytes,
-    pub(crate) took: Duration,
-}
-
-impl EncodeJob {
-    /// Encodes the message.
-    pub(crate) fn run(mut self) -> EncodedMessage {
-        let begun = Instant::now();
-        let mut frame = Vec::new();
-        self.sender.encode(&self.message, || begun.elapsed(), &mut frame);
-        EncodedMessage { channel: self.channel, sender: self.sender, frame: frame.into(), took: begun.elapsed() }
-    }
+    frame: Bytes,
+    took: Duration,
 }
 
 /// The encoders and decoders of a session.
@@ -87,13 +70,9 @@ impl SessionCodecs {
         Self { deadline: t_max.map(|t_max| t_max / SHARE_OF_T_MAX), ..Self::default() }
     }
 
-    /// Sets the quality of JPEG images, 1 to 100 (default: 80).
-    pub(crate) fn set_quality(&mut self, quality: Option<u8>) {
+    /// Sets the codecs that the peer can decode, and the quality of JPEG images, 1 to 100 (default: 80).
+    pub(crate) fn set_peer_codecs(&mut self, names: &[String], quality: Option<u8>) {
         self.jpeg = quality.map_or_else(JpegOptions::default, |quality| JpegOptions { quality });
-    }
-
-    /// Sets the codecs that the peer can decode.
-    pub(crate) fn set_peer_codecs(&mut self, names: &[String]) {
         let has = |codec: &Codec| names.iter().any(|name| name == codec.name());
         self.lossless = LOSSLESS.iter().all(has);
         self.lossy = LOSSY.into_iter().find(has);
@@ -118,14 +97,15 @@ impl SessionCodecs {
         self.lossless && throughput.is_some_and(|rate| rate < FAST)
     }
 
-    /// Creates the job that encodes a message. If `alone` is set, the result is decodable without earlier frames.
+    /// Creates the job that encodes a message on another thread. If `alone` is set, the result is decodable without
+    /// earlier frames.
     pub(crate) fn encode_job(
         &mut self,
         channel: u32,
         message: Bytes,
         alone: bool,
         throughput: Option<f64>,
-    ) -> Option<EncodeJob> {
+    ) -> Option<impl FnOnce() -> EncodedMessage + Send + use<>> {
         let lane = self.lanes.get_mut(&channel)?;
         let policy = match self.lossy {
             Some(Codec::Jpeg) => CodecPolicy::Lossy(LossyCodec::Jpeg(self.jpeg)),
@@ -146,15 +126,20 @@ impl SessionCodecs {
         if let Some(rate) = throughput {
             sender.record_transfer(1 << 20, Duration::from_secs_f64(f64::from(1 << 20) / rate.max(1.0)));
         }
-        Some(EncodeJob { channel, sender, message })
+        Some(move || {
+            let begun = Instant::now();
+            let mut frame = Vec::new();
+            sender.encode(&message, || begun.elapsed(), &mut frame);
+            EncodedMessage { channel, sender, frame: frame.into(), took: begun.elapsed() }
+        })
     }
 
-    /// Returns the encoder to its topic and the frame to the caller.
-    pub(crate) fn finish(&mut self, packed: EncodedMessage) -> Bytes {
+    /// Returns the encoder to its topic, and the frame and the time that it took to the caller.
+    pub(crate) fn finish(&mut self, packed: EncodedMessage) -> (Bytes, Duration) {
         if let Some(lane) = self.lanes.get_mut(&packed.channel) {
             lane.sender = Some(packed.sender);
         }
-        packed.frame
+        (packed.frame, packed.took)
     }
 
     /// Passes the receiver's reply about a frame to the encoder.

@@ -9,8 +9,7 @@
 //!
 //! where answered, present if its flag is set, is: born i64 · serialise u32 · left i64 · taken i64 · given i64
 
-use budget::Permit;
-use bytes::{Buf, BufMut, Bytes, BytesMut};
+use bytes::{Buf, BufMut, Bytes, BytesMut, TryGetError};
 use ros::bus::FailureReason;
 
 use crate::Error;
@@ -37,14 +36,7 @@ pub enum Record<C = Bytes> {
     /// A topic message.
     Data(Data),
     /// A service call.
-    Call {
-        /// Id chosen by the caller's end.
-        id: u32,
-        /// Channel of the service.
-        service: u32,
-        /// Serialized request.
-        request: Bytes,
-    },
+    Call(Call),
     /// The response to a call.
     Answer {
         /// Id of the call.
@@ -58,19 +50,15 @@ pub enum Record<C = Bytes> {
     },
 }
 
-/// A received call.
-#[derive(Debug)]
-pub struct ReceivedCall {
+/// A service call.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Call {
     /// Id chosen by the caller's end.
     pub id: u32,
     /// Channel of the service.
     pub service: u32,
     /// Serialized request.
     pub request: Bytes,
-    /// Memory permit charged to the peer until the call is answered.
-    pub held: Permit,
-    /// Time at which it had been received completely (nanoseconds since the Unix epoch).
-    pub taken: i64,
 }
 
 /// A topic message.
@@ -88,7 +76,7 @@ pub struct Data {
     pub left: i64,
     /// Encoding time in microseconds.
     pub serialise: u32,
-    /// From the cloud: the input to which this may be the response.
+    /// Input to which this may be the response, in records from the cloud.
     pub answered: Option<InputTiming>,
     /// Serialized message.
     pub message: Bytes,
@@ -109,28 +97,24 @@ pub struct InputTiming {
     pub given: i64,
 }
 
+impl InputTiming {
+    fn get(bytes: &mut Bytes) -> Result<Self, TryGetError> {
+        Ok(Self {
+            born: bytes.try_get_i64_le()?,
+            serialise: bytes.try_get_u32_le()?,
+            left: bytes.try_get_i64_le()?,
+            taken: bytes.try_get_i64_le()?,
+            given: bytes.try_get_i64_le()?,
+        })
+    }
+}
+
 /// Returns whether a record that begins with these bytes is a control record.
 pub(crate) fn is_control(bytes: &[u8]) -> bool {
     bytes.first() == Some(&CONTROL)
 }
 
 impl Record {
-    /// Converts the JSON of a control record with `read`. Returns `None` if `read` does.
-    pub(crate) fn try_map_control<C, E>(
-        self,
-        read: impl FnOnce(Bytes) -> Result<Option<C>, E>,
-    ) -> Result<Option<Record<C>>, E> {
-        Ok(Some(match self {
-            Record::Control(json) => match read(json)? {
-                Some(order) => Record::Control(order),
-                None => return Ok(None),
-            },
-            Record::Data(data) => Record::Data(data),
-            Record::Call { id, service, request } => Record::Call { id, service, request },
-            Record::Answer { id, taken, given, response } => Record::Answer { id, taken, given, response },
-        }))
-    }
-
     /// Returns header and payload, in this order on the wire.
     pub fn to_parts(&self) -> (BytesMut, Bytes) {
         let mut head = BytesMut::with_capacity(64);
@@ -158,7 +142,7 @@ impl Record {
                 }
                 data.message.clone()
             }
-            Record::Call { id, service, request } => {
+            Record::Call(Call { id, service, request }) => {
                 head.put_u8(CALL);
                 head.put_u32_le(*id);
                 head.put_u32_le(*service);
@@ -181,56 +165,34 @@ impl Record {
 
     /// Decodes a record. Its payload is a slice of `bytes`, not a copy.
     pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
-        let short = || Error::Protocol("a record that ends in its head");
-        let Some(&kind) = bytes.first() else {
-            return Err(Error::Protocol("an empty record"));
-        };
-        let flags = bytes.get(5).copied().unwrap_or_default();
-        let head = match kind {
-            CONTROL => 1,
-            DATA if flags & ANSWERED != 0 => 62,
-            DATA => 26,
-            CALL => 9,
-            ANSWER => 22,
-            _ => return Err(Error::Protocol("a record of unknown kind")),
-        };
-        if bytes.len() < head {
-            return Err(short());
-        }
-        bytes.advance(1);
-        Ok(match kind {
+        Ok(match bytes.try_get_u8()? {
             CONTROL => Record::Control(bytes),
             DATA => {
-                let channel = bytes.get_u32_le();
-                let flags = bytes.get_u8();
+                let (channel, flags) = (bytes.try_get_u32_le()?, bytes.try_get_u8()?);
                 Record::Data(Data {
                     channel,
                     encoded: flags & ENCODED != 0,
                     latching: flags & LATCHING != 0,
-                    born: bytes.get_i64_le(),
-                    left: bytes.get_i64_le(),
-                    serialise: bytes.get_u32_le(),
-                    answered: (flags & ANSWERED != 0).then(|| InputTiming {
-                        born: bytes.get_i64_le(),
-                        serialise: bytes.get_u32_le(),
-                        left: bytes.get_i64_le(),
-                        taken: bytes.get_i64_le(),
-                        given: bytes.get_i64_le(),
-                    }),
+                    born: bytes.try_get_i64_le()?,
+                    left: bytes.try_get_i64_le()?,
+                    serialise: bytes.try_get_u32_le()?,
+                    answered: (flags & ANSWERED != 0).then(|| InputTiming::get(&mut bytes)).transpose()?,
                     message: bytes,
                 })
             }
-            CALL => Record::Call { id: bytes.get_u32_le(), service: bytes.get_u32_le(), request: bytes },
-            _ => {
-                let id = bytes.get_u32_le();
-                let ok = bytes.get_u8() != 0;
+            CALL => {
+                Record::Call(Call { id: bytes.try_get_u32_le()?, service: bytes.try_get_u32_le()?, request: bytes })
+            }
+            ANSWER => {
+                let (id, ok) = (bytes.try_get_u32_le()?, bytes.try_get_u8()? != 0);
                 Record::Answer {
                     id,
-                    taken: bytes.get_i64_le(),
-                    given: bytes.get_i64_le(),
+                    taken: bytes.try_get_i64_le()?,
+                    given: bytes.try_get_i64_le()?,
                     response: if ok { Ok(bytes) } else { Err(FailureReason::new(String::from_utf8_lossy(&bytes))) },
                 }
             }
+            _ => return Err(Error::Protocol("a record of unknown kind")),
         })
     }
 }
@@ -272,7 +234,10 @@ mod tests {
                 "01 04030201 06 1817161514131211 feffffffffffffff 24232221 0100000000000000 02000000 0300000000000000 \
                  0400000000000000 0500000000000000 6d7367",
             ),
-            (Record::Call { id: 9, service: 10, request: Bytes::from_static(b"ask") }, "02 09000000 0a000000 61736b"),
+            (
+                Record::Call(Call { id: 9, service: 10, request: Bytes::from_static(b"ask") }),
+                "02 09000000 0a000000 61736b",
+            ),
             (answer(Ok(Bytes::from_static(b"yes"))), "03 06000000 01 0700000000000000 0800000000000000 796573"),
             (answer(Err(FailureReason::new("no"))), "03 06000000 00 0700000000000000 0800000000000000 6e6f"),
         ];
@@ -306,7 +271,7 @@ mod tests {
             Record::Control(Bytes::from_static(b"{}")),
             Record::Data(data),
             Record::Data(answered),
-            Record::Call { id: 1, service: 2, request: Bytes::new() },
+            Record::Call(Call { id: 1, service: 2, request: Bytes::new() }),
             Record::Answer { id: 1, taken: 2, given: 3, response: Ok(Bytes::from_static(b"x")) },
             Record::Answer { id: 1, taken: 2, given: 3, response: Err(FailureReason::new("no")) },
         ] {

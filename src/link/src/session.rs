@@ -17,15 +17,16 @@ use ros::bus::FailureReason;
 use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use tokio::time::{Instant, timeout};
+use ws::WsError;
 
 use crate::clock::{ClockFilter, ClockSample, now};
-use crate::control::{ControlMessage, FromCloud, FromRobot, SessionMessage};
-use crate::drops::{Cause, SkipCounts, Tally, TopicDropCount};
+use crate::control::{ControlMessage, FromCloud, FromRobot};
+use crate::drops::{Tally, TopicDropCount};
 use crate::frame::ReceiveProgress;
 use crate::incoming::Incoming;
 use crate::outgoing::{DeliveryMode, Outgoing};
 use crate::packing::SessionCodecs;
-use crate::record::{Data, Record};
+use crate::record::{Call, Data, Record};
 use crate::{Error, LinkLimits, MAX_RECORD, MAX_TOLD, control};
 
 pub use opening::{receive_open, send_open};
@@ -34,16 +35,16 @@ use throughput::{Counters, ThroughputEstimator};
 /// Minimum silence timeout.
 const SHORTEST: Duration = Duration::from_millis(50);
 /// Minimum and maximum silence after which a connection is closed.
-const LOST: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(20));
+const SILENCE_LIMITS: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(20));
 
 /// Name of the memory for control messages in errors.
-const TOLD: &str = "what the other end of a link tells";
+const CONTROL_MEMORY: &str = "what the other end of a link tells";
 
 /// Maximum length of a response that fits into a record.
 const MAX_RESPONSE: usize = MAX_RECORD - 1024;
 
 /// Name of the memory for calls in errors; it is half of a session's, which leaves room for records in flight.
-const CALLED: &str = "calls of the other end of a link";
+const CALL_MEMORY: &str = "calls of the other end of a link";
 
 /// Supervision of a session's connections.
 #[derive(Debug, Clone)]
@@ -66,7 +67,7 @@ impl SessionOptions {
             // A ping is sent and its pong expected within that time.
             ping: (silent / 2).min(Duration::from_secs(2)),
             silent,
-            lost: (silent * 10).clamp(LOST.0, LOST.1),
+            lost: (silent * 10).clamp(SILENCE_LIMITS.0, SILENCE_LIMITS.1),
             max_age,
         }
     }
@@ -89,7 +90,7 @@ pub enum DisconnectReason {
     /// The socket failed.
     #[error("the connection was lost: {0}")]
     Socket(String),
-    /// Nothing was received for this time.
+    /// The peer was silent for this time.
     #[error("nothing was received from the other end for {0:?}")]
     Silent(Duration),
     /// The peer violated the protocol.
@@ -113,6 +114,15 @@ impl DisconnectReason {
     }
 }
 
+impl From<WsError> for DisconnectReason {
+    fn from(error: WsError) -> Self {
+        match error {
+            WsError::Refused { code, reason } => Self::Protocol(Error::Refused { code, reason }),
+            error => Self::Socket(error.to_string()),
+        }
+    }
+}
+
 /// Receives what a peer sends whose control messages are of type `O`.
 pub trait SessionHandler<O>: Sync {
     /// Handles a record that had been received completely at `arrived` (nanoseconds since the Unix epoch). A control
@@ -120,13 +130,9 @@ pub trait SessionHandler<O>: Sync {
     /// is processed or the call answered. Must not block.
     fn on_record(&self, record: Record<O>, held: Permit, arrived: i64);
     /// Handles a message of this channel that cannot be decoded.
-    fn on_undecodable(&self, channel: u32) {
-        let _ = channel;
-    }
+    fn on_undecodable(&self, _channel: u32) {}
     /// Handles a new measurement of the peer's clock; `best` is the current estimate.
-    fn on_clock_sample(&self, best: ClockSample) {
-        let _ = best;
-    }
+    fn on_clock_sample(&self, _best: ClockSample) {}
 }
 
 /// The robot's end of a session.
@@ -153,6 +159,7 @@ pub struct Session<O> {
     orders: PhantomData<fn(O)>,
 }
 
+#[derive(Default)]
 struct State {
     out: Outgoing,
     incoming: Incoming,
@@ -166,7 +173,7 @@ struct State {
     dropped: Tally<String>,
 }
 
-/// How this end closes the session.
+/// Close of the session that this end has requested.
 struct RequestedClose {
     /// WebSocket close code.
     code: u16,
@@ -196,22 +203,13 @@ impl<O: ControlMessage> Session<O> {
         let packing = SessionCodecs::new(options.max_age);
         Self {
             options,
-            state: Mutex::new(State {
-                out: Outgoing::new(age),
-                incoming: Incoming::default(),
-                clock: ClockFilter::default(),
-                packing,
-                throughput: ThroughputEstimator::default(),
-                ending: None,
-                topics: BTreeMap::new(),
-                dropped: Tally::default(),
-            }),
+            state: Mutex::new(State { out: Outgoing::new(age), packing, ..State::default() }),
             wake: Notify::new(),
             up: watch::Sender::new(false),
             asked: AtomicBool::new(false),
             pongs: watch::Sender::new(0),
             next_call: AtomicU32::new(1),
-            told: Budget::new(TOLD, MAX_TOLD),
+            told: Budget::new(CONTROL_MEMORY, MAX_TOLD),
             called: Budget::without_limit(),
             orders: PhantomData,
         }
@@ -222,13 +220,11 @@ impl<O: ControlMessage> Session<O> {
     /// queued for the peer, where messages that do not fit are dropped and a call or response that does not fit ends
     /// the session.
     pub fn with_budget(mut self, budget: &Budget) -> Self {
-        self.told = budget.child(TOLD, MAX_TOLD);
-        self.called = budget.child(CALLED, budget.max_permit() / 2);
-        {
-            let mut state = self.state.lock();
-            state.incoming = Incoming::with_budget(budget);
-            state.out.set_budget(budget);
-        }
+        self.told = budget.child(CONTROL_MEMORY, MAX_TOLD);
+        self.called = budget.child(CALL_MEMORY, budget.max_permit() / 2);
+        let state = self.state.get_mut();
+        state.incoming.budget = Some(budget.clone());
+        state.out.permit = Some(budget.permit());
         self
     }
 
@@ -266,13 +262,6 @@ impl<O: ControlMessage> Session<O> {
         self.state.lock().throughput.estimate()
     }
 
-    /// Returns the numbers of messages that were not sent because newer ones had arrived or they were too old.
-    pub fn skip_counts(&self) -> SkipCounts {
-        let state = self.state.lock();
-        let of = |cause| state.out.dropped.count_for(cause) + state.dropped.count_for(cause);
-        SkipCounts { replaced: of(Cause::Replaced), stale: of(Cause::Stale) }
-    }
-
     /// Returns the numbers of messages that did not reach the peer.
     pub fn drops(&self) -> Vec<TopicDropCount> {
         let state = self.state.lock();
@@ -285,31 +274,34 @@ impl<O: ControlMessage> Session<O> {
         all.per_topic()
     }
 
-    /// Returns the numbers of bytes of records sent and received so far.
-    pub fn traffic(&self) -> (u64, u64) {
-        let state = self.state.lock();
-        (state.out.sent, state.incoming.progress().bytes)
-    }
-
     /// Sends a control message. It will be delivered, in order, over any number of connections. A line of a node is
     /// sent when there is spare capacity, or omitted, which the next line reports.
     pub fn send_control(&self, order: &O) {
-        let Some(record) = control_record(order) else {
-            return;
-        };
-        let out = &mut self.state.lock().out;
-        if order.is_line() {
-            out.push_line(&record);
-        } else {
-            out.push(&record, DeliveryMode::Each);
+        match self.control_record(order) {
+            Some(line) if order.is_line() => self.state.lock().out.push_line(&line),
+            Some(record) => self.state.lock().out.push(&record, DeliveryMode::Each),
+            None => {}
         }
         self.wake.notify_one();
     }
 
-    /// Requests a frame from the peer's session that refers to no earlier one.
-    fn request_keyframe(&self, channel: u32) {
-        if let Some(record) = control_record(&SessionMessage::Keyframe { channel }) {
-            self.push(&record, DeliveryMode::Each);
+    /// Serializes a control message; returns `None` if the peer would not accept it.
+    fn control_record(&self, told: &impl Serialize) -> Option<Record> {
+        let json = serde_json::to_vec(told).unwrap_or_default();
+        let (bytes, limit) = (json.len(), control::max_control_length(&json));
+        let (weight, room) = (JsonWeight::estimate(&json).bytes, self.state.lock().out.peer_limits().told);
+        if bytes > limit || weight > room {
+            tracing::warn!(bytes, limit, weight, room, "a message is too long for the link and was not sent");
+            return None;
+        }
+        Some(Record::Control(json.into()))
+    }
+
+    /// Sends the last control message, behind the newest lines that wait.
+    pub fn send_last(&self, order: &O) {
+        if let Some(record) = self.control_record(order) {
+            self.state.lock().out.push_last(&record);
+            self.wake.notify_one();
         }
     }
 
@@ -321,8 +313,7 @@ impl<O: ControlMessage> Session<O> {
     /// Calls a service. The response arrives as a record with the returned id.
     pub fn call(&self, service: u32, request: Bytes) -> u32 {
         let id = self.next_call.fetch_add(1, Ordering::Relaxed);
-        let call = Record::Call { id, service, request };
-        self.push(&call, DeliveryMode::Each);
+        self.push(&Record::Call(Call { id, service, request }), DeliveryMode::Each);
         id
     }
 
@@ -334,8 +325,7 @@ impl<O: ControlMessage> Session<O> {
                 "the response has {bytes} bytes, more than a link carries ({MAX_RESPONSE})"
             ))),
         });
-        let answer = Record::Answer { id, taken, given: now(), response };
-        self.push(&answer, DeliveryMode::Each);
+        self.push(&Record::Answer { id, taken, given: now(), response }, DeliveryMode::Each);
     }
 
     /// Opens a channel for sending messages of a topic, which was just announced to the peer. Messages may be
@@ -353,23 +343,18 @@ impl<O: ControlMessage> Session<O> {
         self.state.lock().out.order_after_control(channel);
     }
 
-    /// Sets the quality of JPEG images, 1 to 100 (default: 80).
-    pub fn set_quality(&self, quality: Option<u8>) {
-        self.state.lock().packing.set_quality(quality);
-    }
-
     /// Sets the limits that the peer announced in its opening frame. To be called before
     /// [`reconnect`](Self::reconnect).
     pub fn set_peer_limits(&self, limits: LinkLimits) {
         self.state.lock().out.set_limits(limits);
     }
 
-    /// Sets the codecs that the peer announced in its opening frame.
-    pub fn set_peer_codecs(&self, codecs: &[String]) {
+    /// Sets the codecs that the peer announced in its opening frame, and the quality of JPEG images, 1 to 100 (default:
+    /// 80).
+    pub fn set_peer_codecs(&self, codecs: &[String], quality: Option<u8>) {
         let mut state = self.state.lock();
-        state.packing.set_peer_codecs(codecs);
-        let pays = state.packing.is_worthwhile(state.throughput.estimate());
-        state.out.encoding.set_enabled(pays);
+        state.packing.set_peer_codecs(codecs, quality);
+        state.out.encoding.pays = state.packing.is_worthwhile(state.throughput.estimate());
     }
 
     fn push(&self, record: &Record, quality: DeliveryMode) {
@@ -427,31 +412,16 @@ impl<O: ControlMessage> Session<O> {
             Counters { at: Instant::now(), bytes: received.bytes, sent: state.out.sent, idle: state.out.is_idle() };
         if let Some(rate) = state.throughput.update(counters) {
             state.out.set_throughput(rate);
-            let pays = state.packing.is_worthwhile(Some(rate));
-            state.out.encoding.set_enabled(pays);
+            state.out.encoding.pays = state.packing.is_worthwhile(Some(rate));
         }
     }
-}
-
-/// Serializes a control message; returns `None` if the peer would not accept it.
-fn control_record(told: &impl Serialize) -> Option<Record> {
-    let json = serde_json::to_vec(told).unwrap_or_default();
-    let (bytes, limit) = (json.len(), control::max_control_length(&json));
-    let (weight, room) = (JsonWeight::estimate(&json).bytes, MAX_TOLD);
-    if bytes > limit || weight > room {
-        tracing::warn!(bytes, limit, weight, room, "a message is too long for the link and was not sent");
-        return None;
-    }
-    Some(Record::Control(json.into()))
 }
 
 impl Session<FromRobot> {
     /// Closes a channel for sending; the peer is told after all messages queued on it.
     pub fn close_channel(&self, channel: u32) {
         let json = serde_json::to_vec(&FromRobot::Close { channel }).unwrap_or_default();
-        let mut state = self.state.lock();
-        state.out.close_channel(channel, &Record::Control(json.into()));
-        drop(state);
+        self.state.lock().out.close_channel(channel, &Record::Control(json.into()));
         self.wake.notify_one();
     }
 }

@@ -17,17 +17,17 @@ use crate::clock::ClockSample;
 use ros::codec::{Stamps, Time};
 
 /// Differences smaller than this, beyond the error of the measurement, are ignored: 1 ms.
-const NOTICED: i64 = 1_000_000;
+const MIN_DIFFERENCE: i64 = 1_000_000;
 /// Number of stamps remembered in each direction.
-const REMEMBERED: usize = 4096;
+const MAX_STAMPS: usize = 4096;
 const SECOND: i64 = 1_000_000_000;
 
 /// Direction of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
-    /// From the robot to the node.
+    /// Messages from the robot to the node.
     In,
-    /// From the node to the robot.
+    /// Messages from the node to the robot.
     Out,
 }
 
@@ -36,15 +36,8 @@ pub enum Direction {
 pub struct Skew {
     /// Robot's clock minus local clock in nanoseconds; 0: no significant difference.
     difference: AtomicI64,
-    known: Mutex<ConvertedStamps>,
-}
-
-#[derive(Debug, Default)]
-struct ConvertedStamps {
-    /// Local stamp → robot's stamp.
-    robots: StampMap,
-    /// Robot's stamp → local stamp.
-    ours: StampMap,
+    /// Local stamp → robot's stamp, and robot's stamp → local stamp.
+    known: Mutex<[StampMap; 2]>,
 }
 
 impl Skew {
@@ -52,7 +45,7 @@ impl Skew {
     pub fn on_clock_sample(&self, sample: ClockSample) {
         let now = self.difference.load(Ordering::Relaxed);
         // The offset is uncertain within half of the delay (RFC 5905, section 8).
-        let unsure = sample.delay / 2 + NOTICED;
+        let unsure = sample.delay / 2 + MIN_DIFFERENCE;
         if sample.offset.saturating_sub(now).saturating_abs() > unsure {
             self.difference.store(sample.offset, Ordering::Relaxed);
         }
@@ -73,13 +66,8 @@ impl Skew {
         let Some(found) = stamps.find(&message).filter(|found| !found.is_empty()) else {
             return message;
         };
-        let mut message = message.try_into_mut().unwrap_or_else(|shared| {
-            let mut own = BytesMut::with_capacity(shared.len());
-            own.extend_from_slice(&shared);
-            own
-        });
-        let mut known = self.known.lock();
-        let ConvertedStamps { robots, ours } = &mut *known;
+        let mut message = BytesMut::from(message);
+        let [robots, ours] = &mut *self.known.lock();
         let (change, there, back) = match direction {
             Direction::In => (-difference, ours, robots),
             Direction::Out => (difference, robots, ours),
@@ -88,7 +76,7 @@ impl Skew {
             let Some(stamp) = stamps.read(&message, at) else {
                 continue;
             };
-            let changed = there.get(stamp).or_else(|| shift_stamp(stamp, change)).unwrap_or(stamp);
+            let changed = there.found.get(&stamp).copied().or_else(|| shift_stamp(stamp, change)).unwrap_or(stamp);
             if changed != stamp {
                 back.insert(changed, stamp);
                 stamps.write(&mut message, at, changed);
@@ -119,16 +107,12 @@ struct StampMap {
 }
 
 impl StampMap {
-    fn get(&self, key: Time) -> Option<Time> {
-        self.found.get(&key).copied()
-    }
-
     fn insert(&mut self, key: Time, value: Time) {
         if self.found.insert(key, value).is_some() {
             return;
         }
         self.order.push_back(key);
-        if self.order.len() > REMEMBERED {
+        if self.order.len() > MAX_STAMPS {
             if let Some(oldest) = self.order.pop_front() {
                 self.found.remove(&oldest);
             }

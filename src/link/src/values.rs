@@ -18,6 +18,9 @@ const BYTES: &str = "~base64";
 /// Maximum number of changes in one message.
 const MOST_CHANGES: usize = 50_000;
 
+type Tree = BTreeMap<String, ParamValue>;
+type Change = (String, Option<ParamValue>);
+
 /// A value serialized for the link.
 struct JsonParam<'a>(&'a ParamValue);
 
@@ -69,16 +72,11 @@ fn parse_special(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
 pub(crate) mod tree {
     use super::*;
 
-    pub(crate) fn serialize<S: Serializer>(
-        tree: &BTreeMap<String, ParamValue>,
-        serializer: S,
-    ) -> Result<S::Ok, S::Error> {
+    pub(crate) fn serialize<S: Serializer>(tree: &Tree, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_map(tree.iter().map(|(key, value)| (key, JsonParam(value))))
     }
 
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
-        deserializer: D,
-    ) -> Result<BTreeMap<String, ParamValue>, D::Error> {
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Tree, D::Error> {
         // Deserialized as one value, so that the limits for one value apply to all of them.
         match ParamValue::deserialize(deserializer)? {
             ParamValue::Map(mut tree) => {
@@ -94,18 +92,13 @@ pub(crate) mod tree {
 pub(crate) mod changes {
     use super::*;
 
-    pub(crate) fn serialize<S: Serializer>(
-        changes: &[(String, Option<ParamValue>)],
-        serializer: S,
-    ) -> Result<S::Ok, S::Error> {
+    pub(crate) fn serialize<S: Serializer>(changes: &[Change], serializer: S) -> Result<S::Ok, S::Error> {
         let written = changes.iter();
         serializer.collect_seq(written.map(|(key, value)| (key, value.as_ref().map(JsonParam))))
     }
 
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
-        deserializer: D,
-    ) -> Result<Vec<(String, Option<ParamValue>)>, D::Error> {
-        let mut changes = bounded::list::<_, (String, Option<ParamValue>), MOST_CHANGES>(deserializer)?;
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Change>, D::Error> {
+        let mut changes = bounded::list::<_, Change, MOST_CHANGES>(deserializer)?;
         let values = changes.iter_mut().filter_map(|(_, value)| value.as_mut());
         values.for_each(decode_special_values);
         Ok(changes)

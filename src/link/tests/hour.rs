@@ -1,5 +1,6 @@
-//! An hour of a robot with a camera, in simulated time, over a slow link that is cut every minute: what both ends hold
-//! does not grow.
+//! An hour of a robot with a camera, commands and goals and of a node that prints, in simulated time, over a slow link
+//! that is cut every minute and away for a minute every ten: what both ends hold stays below their limits and does not
+//! grow.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
@@ -9,13 +10,13 @@ use std::time::Duration;
 use budget::Permit;
 use bytes::Bytes;
 use link::control::{FromCloud, FromRobot};
-use link::record::{Data, Record};
+use link::record::{Call, Data, Record};
 use link::{CloudSession, DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream, duplex, split};
 use tokio::time::{interval, sleep, timeout};
 use ws::WebSocket;
 
-static HELD: AtomicUsize = AtomicUsize::new(0);
+static HELD_BYTES: AtomicUsize = AtomicUsize::new(0);
 
 /// The system's allocator, counting the bytes that the process holds.
 struct Counting;
@@ -23,13 +24,13 @@ struct Counting;
 // SAFETY: every call goes to the system's allocator as it is; counting neither allocates nor unwinds.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        HELD.fetch_add(layout.size(), Ordering::Relaxed);
+        HELD_BYTES.fetch_add(layout.size(), Ordering::Relaxed);
         // SAFETY: the caller's promises are passed on.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        HELD.fetch_sub(layout.size(), Ordering::Relaxed);
+        HELD_BYTES.fetch_sub(layout.size(), Ordering::Relaxed);
         // SAFETY: the caller's promises are passed on.
         unsafe { System.dealloc(pointer, layout) }
     }
@@ -41,16 +42,24 @@ static ALLOCATOR: Counting = Counting;
 /// Bytes of a picture, and of a command.
 const PICTURE: &[u8] = &[7; 30_000];
 const COMMAND: &[u8] = &[7; 16];
-/// Channels of the pictures, of their answers, and of the commands.
+/// Channels of the pictures, of their answers, of the commands, of the goals, and of their results.
 const PICTURES: u32 = 1;
 const ANSWERS: u32 = 2;
 const COMMANDS: u32 = 3;
-/// What the link carries each way in 50 ms: 500 kbit/s.
+const GOALS: u32 = 4;
+const RESULTS: u32 = 5;
+/// The node prints this many lines in a second, every 90 s: also right after the link has gone for a minute.
+const LINES: usize = 10_000;
+const LINES_EVERY: Duration = Duration::from_secs(90);
+/// Bytes that both ends may hold: for each, 4 MiB of sent messages and lines that are not acknowledged; for the cloud
+/// 1 MiB of lines, which take up to four times their length. The payloads of messages are static here.
+const HOLDS: usize = 12 << 20;
+/// Bytes that the link carries each way in 50 ms: 500 kbit/s.
 const SLICE: usize = 3125;
 const SLICE_TIME: Duration = Duration::from_millis(50);
 /// Growth over the last half hour that is no leak: how much waits differs from cut to cut. A leak of one byte per
 /// message is more.
-const FLUCTUATION: usize = 64 << 10;
+const FLUCTUATION: usize = 128 << 10;
 
 fn message(channel: u32, bytes: &'static [u8]) -> Data {
     Data {
@@ -65,24 +74,45 @@ fn message(channel: u32, bytes: &'static [u8]) -> Data {
     }
 }
 
-/// The cloud's end: answers each call.
+/// The cloud's end: answers each call and each goal.
 struct CloudEnd(Arc<CloudSession>);
 
 impl SessionHandler<FromRobot> for CloudEnd {
     fn on_record(&self, record: Record<FromRobot>, _held: Permit, _arrived: i64) {
-        if let Record::Call { id, request, .. } = record {
-            self.0.answer(id, 0, Ok(request));
+        match record {
+            Record::Call(Call { id, request, .. }) => self.0.answer(id, 0, Ok(request)),
+            Record::Data(Data { channel: GOALS, .. }) => {
+                self.0.publish(message(RESULTS, COMMAND), DeliveryMode::Each);
+            }
+            _ => {}
         }
     }
 }
 
 /// The robot's end: counts what arrives.
 #[derive(Default)]
-struct RobotEnd(AtomicUsize);
+struct RobotEnd {
+    records: AtomicUsize,
+    results: AtomicUsize,
+    lines: AtomicUsize,
+    left_out: AtomicUsize,
+}
 
 impl SessionHandler<FromCloud> for RobotEnd {
-    fn on_record(&self, _record: Record<FromCloud>, _held: Permit, _arrived: i64) {
-        self.0.fetch_add(1, Ordering::Relaxed);
+    fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
+        self.records.fetch_add(1, Ordering::Relaxed);
+        match record {
+            Record::Data(Data { channel: RESULTS, .. }) => {
+                self.results.fetch_add(1, Ordering::Relaxed);
+            }
+            Record::Control(FromCloud::Line { text, .. }) => {
+                // The notice of lines that were left out begins with their number.
+                let number = text.strip_prefix('[').and_then(|text| text.split(' ').next()?.parse().ok());
+                let counter = if number.is_some() { &self.left_out } else { &self.lines };
+                counter.fetch_add(number.unwrap_or(1), Ordering::Relaxed);
+            }
+            _ => {}
+        }
     }
 }
 
@@ -126,7 +156,8 @@ async fn an_hour_of_a_camera_leaves_no_memory_behind() {
     let options = || SessionOptions::for_silence(Duration::from_secs(10), None);
     let robot = Arc::new(RobotSession::new(options()));
     let cloud = Arc::new(CloudSession::new(options()));
-    let (camera, joystick, node) = (Arc::clone(&robot), Arc::clone(&robot), Arc::clone(&cloud));
+    let [camera, joystick, planner] = std::array::from_fn(|_| Arc::clone(&robot));
+    let [node, printer] = std::array::from_fn(|_| Arc::clone(&cloud));
     let sources = [
         tokio::spawn(async move {
             let mut clock = interval(Duration::from_nanos(33_333_333));
@@ -144,6 +175,24 @@ async fn an_hour_of_a_camera_leaves_no_memory_behind() {
             }
         }),
         tokio::spawn(async move {
+            let mut clock = interval(Duration::from_secs(10));
+            loop {
+                clock.tick().await;
+                planner.publish(message(GOALS, COMMAND), DeliveryMode::InOrder);
+            }
+        }),
+        tokio::spawn(async move {
+            let mut clock = interval(LINES_EVERY);
+            loop {
+                clock.tick().await;
+                for _ in 0..20 {
+                    let line = FromCloud::Line { error: false, text: "a line of a node that prints a lot".to_owned() };
+                    (0..LINES / 20).for_each(|_| printer.send_control(&line));
+                    sleep(Duration::from_millis(50)).await;
+                }
+            }
+        }),
+        tokio::spawn(async move {
             let mut clock = interval(Duration::from_millis(64));
             loop {
                 clock.tick().await;
@@ -153,17 +202,26 @@ async fn an_hour_of_a_camera_leaves_no_memory_behind() {
         }),
     ];
     let heard = RobotEnd::default();
-    let mut held = Vec::new();
-    for _ in 0..60 {
-        connect(&robot, &cloud, &heard, Duration::from_secs(57)).await;
-        sleep(Duration::from_secs(3)).await;
-        held.push(HELD.load(Ordering::Relaxed));
+    let (mut held, before) = (Vec::new(), HELD_BYTES.load(Ordering::Relaxed));
+    for minute in 0..60 {
+        if minute % 10 == 9 {
+            sleep(Duration::from_secs(60)).await;
+        } else {
+            connect(&robot, &cloud, &heard, Duration::from_secs(57)).await;
+            sleep(Duration::from_secs(3)).await;
+        }
+        held.push(HELD_BYTES.load(Ordering::Relaxed).saturating_sub(before));
     }
     sources.iter().for_each(tokio::task::JoinHandle::abort);
     let most = |minutes: &[usize]| minutes.iter().copied().max().unwrap_or_default();
     let (earlier, later) = (most(&held[10..30]), most(&held[30..]));
     assert!(later <= earlier + FLUCTUATION, "bytes held after each minute: {held:?}");
-    // Every call was answered, most commands and lines arrived.
-    let heard = heard.0.load(Ordering::Relaxed);
-    assert!(heard > 60 * 57 * 20, "{heard} records arrived at the robot");
+    assert!(most(&held) <= HOLDS, "bytes held after each minute: {held:?}");
+    let counted = [&heard.records, &heard.results, &heard.lines, &heard.left_out];
+    let [records, results, lines, left_out] = counted.map(|counter| counter.load(Ordering::Relaxed));
+    // Every call was answered, most answers and lines arrived.
+    assert!(records > 54 * 57 * 20, "{records} records arrived at the robot");
+    // The goals of the last minute are still with the robot.
+    assert!((350..=354).contains(&results), "{results} results");
+    assert!(lines > 54 * 57 * 10 && left_out > 30 * LINES / 2, "{lines} lines, {left_out} left out");
 }

@@ -11,13 +11,13 @@ use recording::{RecordingFormat, RecordingWriter, Summary};
 use ros::bus::{RosVersion, SerializedMessage, WireType};
 
 use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
-use crate::numbered::IdMap;
-use crate::ring::{EACH, RetentionBounds, Ring, StoredMessage};
+use crate::id_map::IdMap;
+use crate::ring::{MESSAGE_OVERHEAD, RetentionBounds, Ring, StoredMessage};
 
 /// Settings of a black box.
 #[derive(Clone)]
 pub struct BlackBoxSettings {
-    /// How far back messages are kept.
+    /// Age up to which messages are kept.
     pub span: Duration,
     /// Memory limit in bytes, including the overhead per message.
     pub bytes: usize,
@@ -156,14 +156,14 @@ impl Observer for BlackBoxRecorder {
         if topics.is_full() {
             self.forget_ended_topics(&mut topics);
         }
-        let size = of.definition.len() + of.name.len() + topic.len() + EACH;
+        let size = of.definition.len() + of.name.len() + topic.len() + MESSAGE_OVERHEAD;
         let counted = self.options.budget.take(size).ok()?;
         topics.add(RecordedTopic { name: topic.to_owned(), of: Arc::new(of), ended: false, _counted: counted })
     }
 
     fn on_message(&self, topic: u32, message: SerializedMessage) {
         let latched_by = message.latching.then_some(message.publisher);
-        let permit = self.options.budget.take(message.bytes.len() + EACH);
+        let permit = self.options.budget.take(message.bytes.len() + MESSAGE_OVERHEAD);
         let mut ring = self.ring.lock();
         let Ok(permit) = permit else {
             ring.left_out += 1;
@@ -190,7 +190,7 @@ mod tests {
     use ros::bus::PeerId;
 
     use super::*;
-    use crate::numbered::MOST;
+    use crate::id_map::MAX_VALUES;
 
     fn inner(budget: &Budget) -> BlackBoxRecorder {
         let bounds = RetentionBounds { span: Duration::from_secs(3600), bytes: 1 << 20 };
@@ -226,7 +226,7 @@ mod tests {
         assert_eq!(inner.on_topic_started("/two", of.clone()), None, "too much");
         let before = budget.used_bytes();
         (0..10).for_each(|_| inner.on_message(topic, message(&of)));
-        assert_eq!(budget.used_bytes() - before, 10 * EACH);
+        assert_eq!(budget.used_bytes() - before, 10 * MESSAGE_OVERHEAD);
     }
 
     #[test]
@@ -237,7 +237,7 @@ mod tests {
         let kept = inner.on_topic_started("/kept", of.clone()).expect("room");
         inner.on_message(kept, message(&of));
         inner.on_topic_ended("/kept");
-        for number in 0..3 * MOST {
+        for number in 0..3 * MAX_VALUES {
             let topic = format!("/topic{number}");
             assert!(inner.on_topic_started(&topic, of.clone()).is_some(), "{topic}");
             inner.on_topic_ended(&topic);
@@ -248,7 +248,7 @@ mod tests {
         drop(topics);
         assert_eq!(inner.on_topic_started("/kept", of), Some(kept), "as before");
         // The number of simultaneous topics is bounded.
-        for number in 0..MOST {
+        for number in 0..MAX_VALUES {
             let _ = inner.on_topic_started(&format!("/at/once{number}"), WireType::new("a/B", "", ""));
         }
         assert_eq!(inner.on_topic_started("/more", WireType::new("a/B", "", "")), None);

@@ -7,7 +7,7 @@ use parking_lot::Mutex;
 use ros::bus::{SerializedMessage, WireType};
 
 use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
-use crate::numbered::IdMap;
+use crate::id_map::IdMap;
 
 /// Plausible message ages in nanoseconds; stamps of a simulation or a recording lie outside.
 const AGES: std::ops::Range<i64> = -60_000_000_000..60_000_000_000;
@@ -172,7 +172,7 @@ fn has_header(definition: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::numbered::MOST;
+    use crate::id_map::MAX_VALUES;
 
     #[test]
     fn messages_that_begin_with_a_header_have_a_stamp() {
@@ -203,7 +203,7 @@ mod tests {
         let ages = |number| counts.all.lock().get(number).map(|count| count.ages.len());
         assert_eq!(ages(topic), Some(MOST_AGES));
         // Topics that come and go are bounded, too.
-        for number in 0..2 * MOST {
+        for number in 0..2 * MAX_VALUES {
             let topic = format!("/topic{number}");
             assert!(counts.on_topic_started(&topic, of.clone()).is_some(), "{topic}");
             counts.on_topic_ended(&topic);

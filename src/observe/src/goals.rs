@@ -11,10 +11,10 @@ use ros::ros1::actions::messages::{self, ActionlibStatus};
 use tokio::sync::watch;
 
 use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
-use crate::numbered::IdMap;
+use crate::id_map::IdMap;
 
 /// Limit on the goals remembered; beyond it, the oldest ended goal is dropped first.
-const MOST: usize = 200;
+const MAX_GOALS: usize = 200;
 /// Maximum length of an id or a result text in characters.
 const LONGEST: usize = 200;
 
@@ -220,7 +220,7 @@ fn truncate(text: &str) -> String {
 }
 
 fn remember(all: &mut VecDeque<ObservedGoal>, goal: ObservedGoal) {
-    if all.len() >= MOST {
+    if all.len() >= MAX_GOALS {
         let over = all.iter().position(|goal| goal.ended.is_some());
         all.remove(over.unwrap_or(0));
     }
@@ -333,7 +333,7 @@ mod tests {
         for end in 0..whole.len() - b"its own".len() {
             assert_eq!(heard.record_goal("/dock".into(), &whole.slice(..end), "/rover"), None);
         }
-        for number in 0..=MOST {
+        for number in 0..=MAX_GOALS {
             let id = format!("a-{number}");
             heard.record_goal("/dock".into(), &goal(&id), "/rover");
             if number == 1 {
@@ -341,7 +341,7 @@ mod tests {
             }
         }
         let all = heard.all.lock();
-        assert_eq!((all.len(), all[1].id.as_str()), (MOST, "a-2"));
+        assert_eq!((all.len(), all[1].id.as_str()), (MAX_GOALS, "a-2"));
     }
 
     #[test]

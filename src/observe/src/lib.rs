@@ -12,7 +12,7 @@ mod black_box;
 mod figures;
 mod follow;
 mod goals;
-mod numbered;
+mod id_map;
 mod ring;
 
 pub use black_box::{BlackBox, BlackBoxDump, BlackBoxSettings};

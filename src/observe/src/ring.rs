@@ -7,11 +7,11 @@ use bytes::Bytes;
 use ros::bus::PeerId;
 
 /// Estimated overhead of a stored message in bytes.
-pub(crate) const EACH: usize = 256;
+pub(crate) const MESSAGE_OVERHEAD: usize = 256;
 /// Limit on the latched messages kept; beyond it, the oldest are dropped.
-const LATCHED: usize = 1000;
+const MAX_LATCHED: usize = 1000;
 /// Capacity in messages that is never shrunk.
-const FEW: usize = 64;
+const MIN_CAPACITY: usize = 64;
 
 /// A stored message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub struct StoredMessage {
 impl StoredMessage {
     /// Returns the memory used in bytes.
     fn footprint(&self) -> usize {
-        self.bytes.len().saturating_add(EACH)
+        self.bytes.len().saturating_add(MESSAGE_OVERHEAD)
     }
 }
 
@@ -67,7 +67,7 @@ impl TopicRing {
         self.bytes -= gone;
         // Shrinks the capacity again, because topics take turns in needing it.
         let used = self.kept.len();
-        if self.kept.capacity() > FEW && used < self.kept.capacity() / 4 {
+        if self.kept.capacity() > MIN_CAPACITY && used < self.kept.capacity() / 4 {
             self.kept.shrink_to(used * 2);
         }
         gone
@@ -95,7 +95,7 @@ impl LatchedMessages {
             self.bytes -= Self::footprint(&key.1, before);
         }
         self.all.insert(key, message);
-        if self.all.len() > LATCHED {
+        if self.all.len() > MAX_LATCHED {
             self.pop_oldest();
         }
     }
@@ -220,20 +220,20 @@ mod tests {
 
     #[test]
     fn what_is_older_goes_and_what_is_too_much() {
-        let mut young = ring(10, 20 * (1 + EACH));
+        let mut young = ring(10, 20 * (1 + MESSAGE_OVERHEAD));
         (1..=20).for_each(|second| young.push(stored_message(0, second, 1), None));
         assert_eq!(times(&mut young, 20), (10..=20).collect::<Vec<_>>());
         assert_eq!(times(&mut young, 25), (15..=20).collect::<Vec<_>>());
-        let mut small = ring(100, 2 * (10 + EACH) + 5);
+        let mut small = ring(100, 2 * (10 + MESSAGE_OVERHEAD) + 5);
         (1..=20).for_each(|second| small.push(stored_message(0, second, 10), None));
         assert_eq!(times(&mut small, 20), [19, 20]);
-        small.push(stored_message(0, 21, 2 * (10 + EACH) + 6 - EACH), None);
+        small.push(stored_message(0, 21, 2 * (10 + MESSAGE_OVERHEAD) + 6 - MESSAGE_OVERHEAD), None);
         assert_eq!((times(&mut small, 21), small.left_out), (vec![19, 20], 1));
     }
 
     #[test]
     fn what_is_large_goes_before_what_is_small() {
-        let mut ring = ring(100, 20 * (1 + EACH) + 2 * (10_000 + EACH));
+        let mut ring = ring(100, 20 * (1 + MESSAGE_OVERHEAD) + 2 * (10_000 + MESSAGE_OVERHEAD));
         for second in 1..=20 {
             ring.push(stored_message(0, second, 10_000), None);
             ring.push(stored_message(1, second, 1), None);
@@ -245,7 +245,7 @@ mod tests {
 
     #[test]
     fn what_was_latched_before_is_there_once_for_each_publisher() {
-        let mut ring = ring(10, 100 * EACH);
+        let mut ring = ring(10, 100 * MESSAGE_OVERHEAD);
         let publisher = |name: &str| Some(PeerId::from(name));
         ring.push(stored_message(0, 1, 1), publisher("/a"));
         ring.push(stored_message(0, 2, 1), publisher("/b"));
@@ -258,14 +258,14 @@ mod tests {
 
     #[test]
     fn empty_messages_take_room_too() {
-        let mut ring = ring(100, 10 * EACH);
+        let mut ring = ring(100, 10 * MESSAGE_OVERHEAD);
         (1..=50).for_each(|second| ring.push(stored_message(0, second, 0), None));
         assert_eq!(times(&mut ring, 50), (41..=50).collect::<Vec<_>>());
     }
 
     #[test]
     fn topics_that_take_turns_keep_no_room() {
-        let mut ring = ring(100, 1000 * EACH);
+        let mut ring = ring(100, 1000 * MESSAGE_OVERHEAD);
         for topic in 0..20 {
             (0..1000).for_each(|_| ring.push(stored_message(topic, 1, 0), None));
         }
@@ -280,18 +280,18 @@ mod tests {
     fn what_is_latched_counts_and_is_bounded() {
         let publisher = |number: usize| Some(PeerId::new("/a", number as u128));
         // Limited by bytes: the newest remain.
-        let mut small = ring(10, 10 * (100 + EACH + 2));
+        let mut small = ring(10, 10 * (100 + MESSAGE_OVERHEAD + 2));
         (0..50).for_each(|number| small.push(stored_message(0, number as u64, 100), publisher(number)));
         // Much later, only the latched messages remain.
         assert_eq!(times(&mut small, 1000), (40..50).collect::<Vec<_>>());
-        assert_eq!(small.latched.bytes, 10 * (100 + EACH + 2));
+        assert_eq!(small.latched.bytes, 10 * (100 + MESSAGE_OVERHEAD + 2));
         // A later message of the same publisher replaces the earlier one.
         small.push(stored_message(0, 1001, 100), publisher(49));
-        assert_eq!(small.latched.bytes, 10 * (100 + EACH + 2));
+        assert_eq!(small.latched.bytes, 10 * (100 + MESSAGE_OVERHEAD + 2));
         // Limited by their number.
         let mut large = ring(10, usize::MAX / 2);
-        (0..LATCHED + 5).for_each(|number| large.push(stored_message(0, number as u64, 0), publisher(number)));
-        assert_eq!(large.latched.all.len(), LATCHED);
+        (0..MAX_LATCHED + 5).for_each(|number| large.push(stored_message(0, number as u64, 0), publisher(number)));
+        assert_eq!(large.latched.all.len(), MAX_LATCHED);
         assert_eq!(times(&mut large, 100_000).first(), Some(&5));
         assert!(large.has_topic(0));
         large.forget_latched(0);

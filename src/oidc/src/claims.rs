@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 /// Maximum number of groups of a person and maximum length of a group's name in characters; further or longer ones
 /// are ignored.
-const MOST: usize = 1000;
+const MAX_GROUPS: usize = 1000;
 const LONGEST: usize = 200;
 
 /// Claims with a subject.
@@ -63,7 +63,7 @@ impl Claims {
         };
         let texts = texts.iter().filter_map(Value::as_str);
         let short = texts.filter(|text| text.chars().count() <= LONGEST);
-        Some(short.take(MOST).map(str::to_owned).collect())
+        Some(short.take(MAX_GROUPS).map(str::to_owned).collect())
     }
 }
 
@@ -107,9 +107,9 @@ mod tests {
 
     #[test]
     fn more_groups_than_anybody_has_are_not_looked_at() {
-        let many: Vec<String> = (0..MOST + 1).map(|number| number.to_string()).collect();
+        let many: Vec<String> = (0..MAX_GROUPS + 1).map(|number| number.to_string()).collect();
         let all = claims(json!({"sub": "1", "groups": many, "long": ["x".repeat(LONGEST + 1)]}));
-        assert_eq!(all.find_groups("groups").expect("there").len(), MOST);
+        assert_eq!(all.find_groups("groups").expect("there").len(), MAX_GROUPS);
         assert_eq!(all.find_groups("long").expect("there").len(), 0);
     }
 

@@ -20,7 +20,7 @@ pub enum Error {
         /// Underlying error.
         reason: String,
     },
-    /// Too many sign-ins are in progress.
+    /// The limit of concurrent sign-ins is reached.
     #[error("too many sign-ins at once")]
     Busy,
     /// The state is unknown.

@@ -16,7 +16,7 @@ const AGE: Duration = Duration::from_secs(3600);
 /// Minimum interval between refreshes of the keys, whatever tokens demand.
 const KEYS_AGAIN: Duration = Duration::from_secs(60);
 /// Time for which a failure is cached, so that those who waited for it need not wait again.
-const FAILED: Duration = Duration::from_secs(1);
+const FAILURE_EXPIRY: Duration = Duration::from_secs(1);
 
 /// Metadata of the provider.
 pub struct DiscoveredProvider {
@@ -71,7 +71,7 @@ impl MetadataCache {
             return Ok(Arc::clone(known));
         }
         if let Some((at, error)) = &state.failed
-            && (*at >= asked || at.elapsed() < FAILED)
+            && (*at >= asked || at.elapsed() < FAILURE_EXPIRY)
         {
             return Err(error.clone());
         }

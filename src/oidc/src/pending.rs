@@ -10,11 +10,11 @@ use openidconnect::{Nonce, PkceCodeVerifier};
 use crate::Error;
 
 /// Time a person may take to sign in at the provider.
-const TIME: Duration = Duration::from_secs(600);
+const SIGN_IN_TIMEOUT: Duration = Duration::from_secs(600);
 /// Limits on pending sign-ins, in total and per host. The oldest of that host, or of the network that has the most,
 /// is replaced.
-const MOST: usize = 4096;
-const MOST_OF_ONE: usize = 64;
+const MAX_SIGN_INS: usize = 4096;
+const MAX_SIGN_INS_OF_ONE_HOST: usize = 64;
 
 /// A sign-in whose browser has not returned yet.
 pub struct PendingSignIn {
@@ -45,9 +45,9 @@ impl PendingSignIns {
         self.all.retain(|_, (begun, _)| is_fresh(*begun, now));
         let of = Host::from(waiting.from);
         let hosts = || self.all.values().map(|(_, it)| Host::from(it.from));
-        if hosts().filter(|host| *host == of).count() >= MOST_OF_ONE {
+        if hosts().filter(|host| *host == of).count() >= MAX_SIGN_INS_OF_ONE_HOST {
             self.forget_oldest(|host| host == of);
-        } else if self.all.len() >= MOST {
+        } else if self.all.len() >= MAX_SIGN_INS {
             let network = largest_network(hosts());
             self.forget_oldest(|host| Some(host.network()) == network);
         }
@@ -77,7 +77,7 @@ impl PendingSignIns {
 }
 
 fn is_fresh(begun: Instant, now: Instant) -> bool {
-    now.saturating_duration_since(begun) < TIME
+    now.saturating_duration_since(begun) < SIGN_IN_TIMEOUT
 }
 
 #[cfg(test)]
@@ -109,7 +109,7 @@ mod tests {
         // The first caller has used it up.
         assert!(matches!(wrong(pending.take("b", mine, now)), Error::UnknownState));
         assert!(matches!(wrong(pending.take("c", None, now)), Error::OtherBrowser));
-        let late = now + TIME;
+        let late = now + SIGN_IN_TIMEOUT;
         assert!(matches!(wrong(pending.take("d", mine, late)), Error::UnknownState));
     }
 
@@ -117,12 +117,12 @@ mod tests {
     fn a_host_that_begins_many_sign_ins_evicts_its_own() {
         let (mut pending, now) = (PendingSignIns::default(), Instant::now());
         pending.insert("other".into(), pending_sign_in("192.0.2.9"), now);
-        for number in 0..=MOST_OF_ONE as u32 {
+        for number in 0..=MAX_SIGN_INS_OF_ONE_HOST as u32 {
             let from = format!("2001:db8::{number:x}");
             let at = now + Duration::from_millis(number.into());
             pending.insert(number.to_string(), pending_sign_in(&from), at);
         }
-        assert_eq!(pending.all.len(), MOST_OF_ONE + 1);
+        assert_eq!(pending.all.len(), MAX_SIGN_INS_OF_ONE_HOST + 1);
         assert!(!pending.all.contains_key("0"), "the oldest");
         assert!(pending.all.contains_key("other"));
     }
@@ -131,16 +131,16 @@ mod tests {
     fn a_large_network_is_bounded_and_evicts_its_own_sign_ins() {
         let (mut pending, now) = (PendingSignIns::default(), Instant::now());
         pending.insert("other".into(), pending_sign_in("192.0.2.1"), now);
-        for number in 0..MOST + 9 {
+        for number in 0..MAX_SIGN_INS + 9 {
             // Each is another host of the same site.
             let from = format!("2001:db8:0:{number:x}::1");
             let at = now + Duration::from_millis(1 + number as u64);
             pending.insert(number.to_string(), pending_sign_in(&from), at);
         }
-        assert_eq!(pending.all.len(), MOST);
+        assert_eq!(pending.all.len(), MAX_SIGN_INS);
         assert!(pending.all.contains_key("other"));
         assert!(!pending.all.contains_key("0"), "the oldest of its own");
-        pending.insert("later".into(), pending_sign_in("192.0.2.1"), now + 2 * TIME);
+        pending.insert("later".into(), pending_sign_in("192.0.2.1"), now + 2 * SIGN_IN_TIMEOUT);
         assert_eq!(pending.all.len(), 1);
     }
 }

@@ -1,5 +1,9 @@
-//! HTTP/1.1 client (RFC 9110, RFC 9112) for the daemon's requests to third-party servers, over TLS: one connection
-//! per request, limited in time and bytes. Redirects are not followed, and plain text never leaves this machine.
+//! HTTP/1.1 client (RFC 9110, RFC 9112) for requests to third-party servers, over TLS: one connection per request,
+//! limited in time and bytes. Redirects are not followed, and plain text never leaves this machine.
+//!
+//! ```text
+//!   send ─▶ the whole response        open ─▶ head ─▶ OutboundBody::next_chunk …
+//! ```
 
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -7,6 +11,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full, Limited};
+use hyper::body::Incoming;
 use hyper::client::conn::http1;
 use hyper::header::{CONNECTION, HOST, HeaderValue};
 use hyper::{Request, Response, Uri};
@@ -14,6 +19,8 @@ use hyper_util::rt::TokioIo;
 use tls::Trust;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
 
 /// Default timeout of a request, from DNS lookup to the last byte of the response.
 const TIME: Duration = Duration::from_secs(15);
@@ -61,6 +68,14 @@ pub enum Error {
         /// The timeout.
         time: Duration,
     },
+    /// The response body stopped arriving.
+    #[error("no data came from {server} for {} s", .time.as_secs())]
+    Stalled {
+        /// Host and port of the server.
+        server: String,
+        /// The longest pause.
+        time: Duration,
+    },
 }
 
 /// HTTP client for third-party servers.
@@ -89,50 +104,105 @@ impl OutboundClient {
     pub async fn send(&self, request: Request<Full<Bytes>>) -> Result<Response<Bytes>, Error> {
         let address = ServerAddress::from_uri(request.uri())?;
         let server = address.authority();
-        match tokio::time::timeout(self.time, self.exchange(&address, request)).await {
-            Ok(answer) => answer,
-            Err(_) => Err(Error::Late { server, time: self.time }),
-        }
+        let whole = async {
+            let (answer, _connection) = self.exchange(&address, request).await?;
+            let (parts, body) = answer.into_parts();
+            let body = Limited::new(body, self.bytes).collect().await;
+            let body = body.map_err(|error| Error::Unreadable { server: server.clone(), reason: error.to_string() })?;
+            Ok(Response::from_parts(parts, body.to_bytes()))
+        };
+        let answer = timeout(self.time, whole).await;
+        answer.unwrap_or_else(|_| Err(Error::Late { server: server.clone(), time: self.time }))
     }
 
-    async fn exchange(&self, address: &ServerAddress, request: Request<Full<Bytes>>) -> Result<Response<Bytes>, Error> {
+    /// Sends a request to the server of its URL and returns the response when its head has arrived, within the
+    /// client's time. The body is limited by who reads it, and each pause in it by the client's time.
+    pub async fn open(&self, request: Request<Full<Bytes>>) -> Result<Response<OutboundBody>, Error> {
+        let address = ServerAddress::from_uri(request.uri())?;
+        let (server, pause) = (address.authority(), self.time);
+        let answer = timeout(self.time, self.exchange(&address, request)).await;
+        let (answer, connection) = answer.map_err(|_| Error::Late { server: server.clone(), time: self.time })??;
+        Ok(answer.map(|incoming| OutboundBody { server, incoming, pause, _connection: connection }))
+    }
+
+    /// Sends a request over a connection of its own.
+    async fn exchange(
+        &self,
+        address: &ServerAddress,
+        request: Request<Full<Bytes>>,
+    ) -> Result<(Response<Incoming>, ConnectionTask), Error> {
         let unreachable = |source| Error::Unreachable { server: address.authority(), source };
         let stream = TcpStream::connect((address.host.as_str(), address.port)).await.map_err(unreachable)?;
         if !address.secure {
-            return self.send_over(stream, address, request).await;
+            return send_over(stream, address, request).await;
         }
         let connected = self.trust.connect(stream, &address.host, &address.authority()).await.map_err(unreachable)?;
-        self.send_over(connected.stream, address, request).await
+        send_over(connected.stream, address, request).await
+    }
+}
+
+async fn send_over<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
+    stream: S,
+    address: &ServerAddress,
+    mut request: Request<Full<Bytes>>,
+) -> Result<(Response<Incoming>, ConnectionTask), Error> {
+    let no_answer = |source| Error::NoAnswer { server: address.authority(), source };
+    let named = HeaderValue::from_str(&address.named).map_err(|_| address.invalid_address())?;
+    request.headers_mut().insert(HOST, named);
+    let close = HeaderValue::from_static("close");
+    request.headers_mut().insert(CONNECTION, close);
+    // Origin form of the request target (RFC 9112, section 3.2.1).
+    let path = request.uri().path_and_query().cloned();
+    *request.uri_mut() = path.map_or(Uri::from_static("/"), Uri::from);
+    let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(no_answer)?;
+    let connection = ConnectionTask(tokio::spawn(async move {
+        // Its error is that of the response or of its body.
+        let _ = connection.await;
+    }));
+    let answer = sender.send_request(request).await.map_err(no_answer)?;
+    Ok((answer, connection))
+}
+
+/// Task of a connection, which ends after its only response, or when the response is dropped.
+#[derive(Debug)]
+struct ConnectionTask(JoinHandle<()>);
+
+impl Drop for ConnectionTask {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// Body of a response, which arrives while it is read.
+#[derive(Debug)]
+pub struct OutboundBody {
+    server: String,
+    incoming: Incoming,
+    pause: Duration,
+    _connection: ConnectionTask,
+}
+
+impl OutboundBody {
+    /// Returns the next bytes; `None` at the end.
+    ///
+    /// # Errors
+    /// [`Error::Unreadable`] if the body is cut short, [`Error::Stalled`] if nothing arrives for the client's time.
+    pub async fn next_chunk(&mut self) -> Result<Option<Bytes>, Error> {
+        loop {
+            let frame = timeout(self.pause, self.incoming.frame()).await;
+            let frame = frame.map_err(|_| Error::Stalled { server: self.server.clone(), time: self.pause })?;
+            let Some(frame) = frame.transpose().map_err(|error| self.to_unreadable(&error))? else {
+                return Ok(None);
+            };
+            // Trailers say nothing that is used.
+            if let Ok(data) = frame.into_data() {
+                return Ok(Some(data));
+            }
+        }
     }
 
-    async fn send_over<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
-        &self,
-        stream: S,
-        address: &ServerAddress,
-        mut request: Request<Full<Bytes>>,
-    ) -> Result<Response<Bytes>, Error> {
-        let no_answer = |source| Error::NoAnswer { server: address.authority(), source };
-        let unreadable = |reason: String| Error::Unreadable { server: address.authority(), reason };
-        let named = HeaderValue::from_str(&address.named).map_err(|_| address.invalid_address())?;
-        request.headers_mut().insert(HOST, named);
-        let close = HeaderValue::from_static("close");
-        request.headers_mut().insert(CONNECTION, close);
-        // Origin form of the request target (RFC 9112, section 3.2.1).
-        let path = request.uri().path_and_query().cloned();
-        *request.uri_mut() = path.map_or(Uri::from_static("/"), Uri::from);
-        let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(no_answer)?;
-        let answer = async {
-            let answer = sender.send_request(request).await.map_err(no_answer)?;
-            let (parts, body) = answer.into_parts();
-            let body = Limited::new(body, self.bytes).collect().await.map_err(|error| unreadable(error.to_string()))?;
-            Ok(Response::from_parts(parts, body.to_bytes()))
-        };
-        // The connection ends after its only response, or when the request is dropped.
-        tokio::pin!(answer);
-        tokio::select! {
-            answer = &mut answer => answer,
-            _ = connection => answer.await,
-        }
+    fn to_unreadable(&self, error: &hyper::Error) -> Error {
+        Error::Unreadable { server: self.server.clone(), reason: error.to_string() }
     }
 }
 
@@ -259,6 +329,48 @@ mod tests {
         let (address, _) = server(b"HTTP/1.1 200 OK\r\ncontent-length: 50\r\n\r\nhello".to_vec()).await;
         let refused = client().send(get(&address)).await.expect_err("cut");
         assert!(matches!(refused, Error::Unreadable { .. }), "{refused}");
+    }
+
+    #[tokio::test]
+    async fn a_long_answer_is_read_while_it_arrives() {
+        let mut long = b"HTTP/1.1 200 OK\r\ncontent-length: 2000000\r\n\r\n".to_vec();
+        long.extend(vec![b'x'; 2_000_000]);
+        let (address, _) = server(long.clone()).await;
+        // The limit is for answers that are kept as a whole.
+        let mut answer = client().with_limits(TIME, 10).open(get(&address)).await.expect("a head");
+        let mut read = 0;
+        while let Some(chunk) = answer.body_mut().next_chunk().await.expect("data") {
+            read += chunk.len();
+        }
+        assert_eq!((answer.status().as_u16(), read), (200, 2_000_000));
+        long.truncate(1_000_000);
+        let (address, _) = server(long).await;
+        let mut answer = client().open(get(&address)).await.expect("a head");
+        let cut = loop {
+            match answer.body_mut().next_chunk().await {
+                Ok(chunk) => assert!(chunk.is_some(), "half of it is no whole answer"),
+                Err(error) => break error,
+            }
+        };
+        assert!(matches!(cut, Error::Unreadable { .. }), "{cut}");
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_stops_arriving_is_given_up() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = format!("http://{}", listener.local_addr().expect("bound"));
+        let (read, waited) = tokio::sync::oneshot::channel::<()>();
+        tokio::spawn(async move {
+            let (mut stream, _) = listener.accept().await.expect("a connection");
+            stream.write_all(b"HTTP/1.1 200 OK\r\ncontent-length: 9\r\n\r\nhalf").await.expect("sent");
+            let _ = waited.await;
+        });
+        let patient = client().with_limits(Duration::from_secs(1), 10);
+        let mut answer = patient.open(get(&address)).await.expect("a head");
+        assert_eq!(answer.body_mut().next_chunk().await.expect("data").as_deref(), Some(&b"half"[..]));
+        let stalled = answer.body_mut().next_chunk().await.expect_err("no more comes");
+        assert!(matches!(stalled, Error::Stalled { .. }), "{stalled}");
+        drop(read);
     }
 
     #[tokio::test]

@@ -1,5 +1,7 @@
 //! Parser for the command syntax of CMake; nothing is evaluated.
 
+use std::collections::BTreeSet;
+
 /// A command with its arguments, without quotes and with variables unexpanded.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Command {
@@ -10,7 +12,7 @@ pub(crate) struct Command {
 
 /// Parses the commands of a file. An unterminated command and everything after it are left out.
 pub(crate) fn parse_commands(text: &str) -> Vec<Command> {
-    let mut reader = CmakeParser { rest: text };
+    let mut reader = CmakeParser { rest: text, unclosed: BTreeSet::new() };
     let mut found = Vec::new();
     loop {
         reader.skip_space();
@@ -35,6 +37,9 @@ pub(crate) fn parse_commands(text: &str) -> Vec<Command> {
 
 struct CmakeParser<'a> {
     rest: &'a str,
+    /// Numbers of `=` in closing brackets that do not come any more: looked for at each opening one, a file of a
+    /// mebibyte would take minutes.
+    unclosed: BTreeSet<usize>,
 }
 
 impl<'a> CmakeParser<'a> {
@@ -75,8 +80,14 @@ impl<'a> CmakeParser<'a> {
         let inside = self.rest.strip_prefix('[')?;
         let signs = inside.len() - inside.trim_start_matches('=').len();
         let inside = inside[signs..].strip_prefix('[')?;
+        if self.unclosed.contains(&signs) {
+            return None;
+        }
         let end = format!("]{}]", "=".repeat(signs));
-        let (text, rest) = inside.split_once(end.as_str())?;
+        let Some((text, rest)) = inside.split_once(end.as_str()) else {
+            self.unclosed.insert(signs);
+            return None;
+        };
         self.rest = rest;
         Some(text)
     }
@@ -167,5 +178,14 @@ mod tests {
         for nothing in ["", "(", ")", "x", "x(", "# x(", "\u{fffd}(]", "[[", "a([["] {
             assert!(parse_commands(nothing).is_empty(), "{nothing}");
         }
+    }
+
+    #[test]
+    fn closing_brackets_that_do_not_come_are_looked_for_once() {
+        // Looked for at each of the opening ones, this would take minutes.
+        let text = format!("set(X {}) done()", "[[ [=[ #[[\n".repeat(80_000));
+        let found: Vec<(String, usize)> =
+            parse_commands(&text).into_iter().map(|command| (command.name, command.arguments.len())).collect();
+        assert_eq!(found, [("set".to_owned(), 160_001), ("done".to_owned(), 0)]);
     }
 }

@@ -228,7 +228,7 @@ pub enum Error {
         robot: u8,
         /// Name of the service.
         service: String,
-        /// For each type, what it is used for, and its fields that have no equivalent.
+        /// Use of each type, and its fields that have no equivalent.
         problems: Vec<String>,
     },
     /// The types of the interface in the other ROS are not valid together.

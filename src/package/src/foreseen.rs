@@ -7,6 +7,7 @@
 mod executables;
 mod problems;
 mod scripts;
+mod variables;
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -19,6 +20,7 @@ use crate::workspace::{Package, Workspace};
 use executables::BuildFileScan;
 
 pub use problems::{SourceProblem, find_problems, has_no_programs};
+pub use variables::{SetVariable, find_set_variable};
 
 /// Minimum content of the image of a workspace.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

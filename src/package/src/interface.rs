@@ -87,7 +87,7 @@ pub struct Topic {
     /// Nodes of the package that publish or subscribe to the topic.
     #[serde(default)]
     pub nodes: Vec<String>,
-    /// For outputs: true if new subscribers get the last message.
+    /// True for an output whose new subscribers get the last message.
     #[serde(default)]
     pub latched: bool,
     /// True if registered only while an output has subscribers, or once the node has received what it waits for.

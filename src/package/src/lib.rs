@@ -46,5 +46,6 @@ mod supplement;
 pub mod system;
 mod twins;
 pub mod workspace;
+pub mod xml;
 
 pub use error::Error;

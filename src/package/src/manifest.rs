@@ -6,7 +6,7 @@ use std::path::Path;
 use roxmltree::{Document, Node};
 
 use crate::condition::Variables;
-use crate::{Error, names, read};
+use crate::{Error, names, read, xml};
 
 /// Group of the packages for whose `.msg`, `.srv` and `.action` files rosidl generates code.
 pub const INTERFACES: &str = "rosidl_interface_packages";
@@ -102,7 +102,12 @@ impl Manifest {
 
     /// Parses the text of a file; `path` is used in messages.
     pub fn parse(text: &str, path: &Path, variables: &Variables) -> Result<Self, Error> {
-        let document = Document::parse(text).map_err(|error| xml_error(path, &error))?;
+        let document = xml::parse(text).map_err(|error| Error::Manifest {
+            path: path.to_owned(),
+            line: error.line,
+            column: error.column,
+            problem: error.problem,
+        })?;
         let reader = ManifestReader { document: &document, path, variables };
         reader.parse_manifest()
     }
@@ -125,19 +130,6 @@ impl Manifest {
     pub fn needs(&self, kinds: &[Kind]) -> BTreeSet<&str> {
         let wanted = self.dependencies.iter().filter(|dependency| kinds.contains(&dependency.kind));
         wanted.map(|dependency| dependency.name.as_str()).collect()
-    }
-}
-
-fn xml_error(path: &Path, error: &roxmltree::Error) -> Error {
-    let position = error.pos();
-    let text = error.to_string();
-    // The position is already part of the error.
-    let problem = text.strip_suffix(&format!(" at {position}")).unwrap_or(&text);
-    Error::Manifest {
-        path: path.to_owned(),
-        line: position.row,
-        column: position.col,
-        problem: format!("malformed XML: {problem}"),
     }
 }
 
@@ -383,7 +375,7 @@ mod tests {
     }
 
     /// A typical package.xml for both ROS versions.
-    const OF_BOTH: &str = r#"<?xml version="1.0"?>
+    const MANIFEST_OF_BOTH: &str = r#"<?xml version="1.0"?>
         <package format="3">
           <name>both_msgs</name><version>1.0.0</version>
           <buildtool_depend condition="$ROS_VERSION == 1">catkin</buildtool_depend>
@@ -402,7 +394,7 @@ mod tests {
     fn one_manifest_for_both_versions() {
         let read = |version, distribution| {
             let variables = Variables::for_distribution(version, distribution);
-            Manifest::parse(OF_BOTH, Path::new("package.xml"), &variables).unwrap()
+            Manifest::parse(MANIFEST_OF_BOTH, Path::new("package.xml"), &variables).unwrap()
         };
         let one = read(1, "noetic");
         assert_eq!(one.build_type, "catkin");

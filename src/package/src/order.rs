@@ -7,7 +7,7 @@ use crate::manifest::Kind;
 use crate::workspace::Package;
 
 /// Dependencies that must be built before a package.
-const BEFORE: [Kind; 4] = [Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport];
+const BUILD_DEPENDENCIES: [Kind; 4] = [Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport];
 
 /// Sorts packages after their build dependencies, otherwise by name.
 pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error> {
@@ -43,7 +43,7 @@ fn build_prerequisites<'a>(
     replaced: &'a BTreeMap<String, String>,
 ) -> BTreeSet<&'a str> {
     let own = &package.manifest;
-    let mut names = own.needs(&BEFORE);
+    let mut names = own.needs(&BUILD_DEPENDENCIES);
     let others: Vec<&str> = names.iter().filter_map(|name| replaced.get(*name)).map(String::as_str).collect();
     names.extend(others);
     names.retain(|name| waiting.contains_key(*name));

@@ -13,11 +13,11 @@ pub struct Request {
     pub node: String,
     /// Topics, as named at the push, and how an answer is matched.
     pub pair: TopicPair,
-    /// How the pair was determined.
+    /// Way in which the pair was determined.
     pub reason: Reason,
 }
 
-/// How a request pair was determined.
+/// Way in which a request pair was determined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Reason {

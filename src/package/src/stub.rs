@@ -11,21 +11,21 @@
 
 mod ament;
 mod catkin;
-mod contents;
 mod info;
 mod manifest;
 mod message_packages;
 mod needed;
 mod nodelets;
 mod other_ros;
+mod package_files;
 mod settings;
 
 use std::collections::BTreeSet;
 
-pub use contents::{Content, Contents};
 pub use info::{Files, Portal, ProgramRequest, StubInfo};
 use info::{RosTerms, definition_path, text_file};
 pub use manifest::{MANIFEST, SIGNATURE, SIGNER, manifest};
+pub use package_files::{Content, Contents};
 use ros::bus::RosVersion;
 
 use crate::Error;
@@ -116,8 +116,8 @@ fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String>
 impl RosTerms {
     fn for_ros(ros: RosVersion) -> &'static RosTerms {
         match ros {
-            RosVersion::One => &catkin::WORDS,
-            RosVersion::Two => &ament::WORDS,
+            RosVersion::One => &catkin::TERMS,
+            RosVersion::Two => &ament::TERMS,
         }
     }
 }

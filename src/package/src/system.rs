@@ -8,6 +8,7 @@
 //!           └─ programs and Python modules        ─▶ what is there to compile and to launch with
 //! ```
 
+mod dpkg;
 mod environment;
 mod spaces;
 mod view;
@@ -16,15 +17,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use ros::bus::RosVersion;
+use ros::ros2::middleware;
 
 use crate::Error;
 
-pub use environment::{MIDDLEWARES, make_environment};
+pub use dpkg::{InstalledPackage, parse_status};
+pub use environment::{choose_middleware, make_environment};
 pub use spaces::{RosSpace, SpaceLayout};
 use view::View;
 
 /// Directories that are replaced by scratch space in a servant, so that files of the image there are not visible.
-pub const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
+pub const HIDDEN_DIRECTORIES: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
 
 /// Maximum size of a list of installed packages in bytes.
 const LARGEST_STATUS: u64 = 64 << 20;
@@ -41,7 +44,7 @@ const MODULES: [&str; 7] = ["catkin_pkg", "em", "launch_ros", "numpy", "rospkg",
 /// Reason why the layers are not a system that packages of ROS can be built upon.
 #[derive(Debug, thiserror::Error)]
 pub enum SystemError {
-    /// There is no ROS.
+    /// The image has no ROS.
     #[error(
         "no ROS was found: looked for install spaces (.catkin, share/ament_index) that the image's environment names, \
             or that are at most {depth} directories deep, such as /opt/ros/jazzy, and for Debian's rospy{also}; \
@@ -52,7 +55,7 @@ pub enum SystemError {
         /// Spaces that cannot be used, with the reason, or nothing.
         also: String,
     },
-    /// There are several, and nothing says which one counts.
+    /// The image has several, and nothing says which one counts.
     #[error("it has several ROS distributions ({}); name one with --ros-distro", .0.join(", "))]
     SeveralRos(Vec<String>),
     /// Nothing says which distribution it is.
@@ -66,7 +69,7 @@ pub enum SystemError {
     NoSuchRos {
         /// Requested distribution.
         wanted: String,
-        /// What there is.
+        /// Names that exist.
         found: Vec<String>,
     },
     /// There is no Python 3.
@@ -77,6 +80,12 @@ pub enum SystemError {
     /// ROS is for Python 2.
     #[error("ROS {0} in it is for Python 2, which is not supported; import an image of ROS noetic or of ROS 2")]
     PythonTwo(String),
+    /// Nodes of ROS 2 could use a middleware only that the bus does not speak.
+    #[error(
+        "of middlewares it has {0} alone, which speaks Zenoh, and Cloudroid speaks DDS only; add \
+            rmw_fastrtps_cpp or rmw_cyclonedds_cpp to the image"
+    )]
+    Middleware(String),
     /// It is for other machines.
     #[error("it is for {its}, but this machine is {ours}; import a system for {ours}")]
     Architecture {
@@ -85,6 +94,9 @@ pub enum SystemError {
         /// Architecture of this machine.
         ours: &'static str,
     },
+    /// dpkg's list is longer than that of any system.
+    #[error("dpkg lists more than {0} packages in it")]
+    TooManyPackages(usize),
     /// The layers cannot be read.
     #[error(transparent)]
     Layers(#[from] Error),
@@ -109,8 +121,8 @@ pub struct FoundSystem {
     pub unusable: Vec<(String, &'static str)>,
     /// Version of Python: `3.12`.
     pub python: String,
-    /// dpkg's list of packages, if there is one.
-    pub dpkg_status: Option<String>,
+    /// Packages that dpkg has installed, with their versions; `None` if it has no list.
+    pub debian: Option<BTreeMap<String, String>>,
     /// Names of the programs, Python modules and headers that were looked for and are there.
     pub tools: BTreeSet<&'static str>,
 }
@@ -165,8 +177,9 @@ pub fn find_system<L: AsRef<Path>>(
     if chosen.spaces.iter().any(|space| space.is_for_python_two) {
         return Err(SystemError::PythonTwo(chosen.distribution));
     }
+    let status = view.read_text("/var/lib/dpkg/status", LARGEST_STATUS)?;
     let prefixes: Vec<String> = chosen.spaces.iter().flat_map(RosSpace::prefixes).collect();
-    Ok(FoundSystem {
+    let system = FoundSystem {
         distribution: word("ID").unwrap_or_else(|| "linux".to_owned()),
         suite: word("VERSION_CODENAME").or_else(|| word("VERSION_ID")).unwrap_or_else(|| "unknown".to_owned()),
         title: field("PRETTY_NAME").unwrap_or_else(|| "a system without os-release".to_owned()),
@@ -176,8 +189,23 @@ pub fn find_system<L: AsRef<Path>>(
         spaces: chosen.spaces,
         unusable: chosen.unusable,
         python,
-        dpkg_status: view.read_text("/var/lib/dpkg/status", LARGEST_STATUS)?,
-    })
+        debian: status.as_deref().map(dpkg::list_installed).transpose()?,
+    };
+    check_middleware(&system)?;
+    Ok(system)
+}
+
+/// Refuses a system of ROS 2 that has a middleware over Zenoh, and none that the bus speaks. One without any may get it
+/// from the archive.
+fn check_middleware(system: &FoundSystem) -> Result<(), SystemError> {
+    if system.ros == RosVersion::One || system.first_package(&middleware::SUPPORTED).is_some() {
+        return Ok(());
+    }
+    let mut names = system.spaces.iter().flat_map(|space| space.packages.keys());
+    match names.find(|name| middleware::is_zenoh(name)) {
+        Some(name) => Err(SystemError::Middleware(name.clone())),
+        None => Ok(()),
+    }
 }
 
 /// Reads os-release, whose values may be quoted as in a shell. Control characters are dropped.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use ros::bus::RosVersion;
+use ros::bus::parameter_names::spell_in_ros1;
 use ros::schema::{Base, MessageType, Registry};
 use translation::TypeTranslations;
 
@@ -63,7 +64,7 @@ impl Interface {
 /// Renames a node's own parameter as it stands on the Master of a robot of ROS 1.
 fn share_parameter(parameter: &mut Parameter) {
     if let Some(own) = parameter.own_name() {
-        parameter.name = format!("{}/{}", parameter.node, own.replace('.', "/"));
+        parameter.name = format!("{}/{}", parameter.node, spell_in_ros1(own));
     }
     parameter.node.clear();
 }

@@ -209,7 +209,7 @@ pub async fn trial(
         Kind::Image => Picture::read(&bytes)
             .map(|picture| Material::Pictures(vec![picture]))
             .map_err(|error| Error::BadRequest(error.to_string())),
-        Kind::Bag => ros::bag::read(&bytes, reach::RECORDED)
+        Kind::Bag => ros::bag::read(&bytes, reach::MAX_RECORDED)
             .map(Material::Bag)
             .map_err(|error| Error::BadRequest(error.to_string())),
     });

@@ -94,7 +94,7 @@ pub async fn read_recording(app: &App, caller: &Caller, body: Body) -> Result<Bu
 mod tests {
     use super::*;
 
-    const LONG: Duration = Duration::from_secs(3600);
+    const PATIENCE: Duration = Duration::from_secs(3600);
 
     /// Creates a body that delivers `length` bytes and then stalls.
     fn unfinished_body(length: usize) -> Body {
@@ -110,7 +110,7 @@ mod tests {
         for _ in 0..4 {
             let budget = budget.clone();
             let body = unfinished_body(6 << 20);
-            reading.spawn(async move { read(body, 512 << 20, &budget, LONG).await });
+            reading.spawn(async move { read(body, 512 << 20, &budget, PATIENCE).await });
         }
         for _ in 0..3 {
             let refused = reading.join_next().await.expect("one").expect("no panic");
@@ -126,7 +126,7 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_body_that_stays_unfinished_is_given_up() {
         let budget = Budget::without_limit();
-        let refused = read(unfinished_body(1 << 20), 2 << 20, &budget, LONG).await;
+        let refused = read(unfinished_body(1 << 20), 2 << 20, &budget, PATIENCE).await;
         let refused = refused.expect_err("it never ends");
         assert_eq!(refused.problem().status, 408, "{refused}");
         assert_eq!(budget.used_bytes(), 0);
@@ -136,7 +136,7 @@ mod tests {
     async fn a_body_may_be_as_long_as_its_senders_budget() {
         let most = (8 << 20) + 1000;
         let budget = Budget::new("client x", most);
-        let held = read(Body::from(vec![7; most]), most, &budget, LONG).await;
+        let held = read(Body::from(vec![7; most]), most, &budget, PATIENCE).await;
         assert_eq!(held.expect("it fits").bytes.len(), most);
     }
 
@@ -169,13 +169,13 @@ mod tests {
     #[tokio::test]
     async fn a_whole_body_counts_for_as_long_as_it_is_held() {
         let budget = Budget::new("client x", 8 << 20);
-        let held = read(Body::from(vec![7; 3 << 20]), 4 << 20, &budget, LONG).await;
+        let held = read(Body::from(vec![7; 3 << 20]), 4 << 20, &budget, PATIENCE).await;
         let held = held.expect("it fits");
         assert_eq!(held.bytes, vec![7; 3 << 20]);
         assert!(budget.used_bytes() >= 3 << 20);
         drop(held);
         assert_eq!(budget.used_bytes(), 0);
-        let refused = read(Body::from(vec![7; 100]), 99, &budget, LONG).await;
+        let refused = read(Body::from(vec![7; 100]), 99, &budget, PATIENCE).await;
         assert_eq!(refused.expect_err("too long").problem().status, 413);
     }
 }

@@ -12,7 +12,7 @@ use axum::extract::{OriginalUri, Path, State};
 use axum::response::Response;
 use choreographer::{CalibrationRequests, CaptureBounds};
 use futures_util::StreamExt;
-use reach::{Material, Picture, RECORDED};
+use reach::{MAX_RECORDED, Material, Picture};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::task::AbortOnDropHandle;
@@ -32,7 +32,7 @@ const LONGEST: f64 = 600.0;
 /// Default limit on the captured bytes.
 const BYTES: Size = Size(256 << 20);
 /// Maximum time in seconds that a servant is kept under its last limit.
-const KEPT: f64 = 600.0;
+const MAX_KEEP_TIME: f64 = 600.0;
 /// Minimum memory limit in bytes that can be measured; nothing starts with less.
 const LEAST_MEMORY: f64 = (16 << 20) as f64;
 /// Maximum number of limits measured in one calibration, and of requests at each.
@@ -95,7 +95,7 @@ async fn read_material(
         Source::Frames => Picture::read_all(&bytes)
             .map(|(pictures, count)| (Some((pictures.len(), count)), Material::Pictures(pictures)))
             .map_err(|error| Error::BadRequest(error.to_string())),
-        Source::Bag | Source::Live => ros::bag::read(&bytes, RECORDED)
+        Source::Bag | Source::Live => ros::bag::read(&bytes, MAX_RECORDED)
             .map(|recorded| (None, Material::Bag(recorded)))
             .map_err(|error| Error::BadRequest(error.to_string())),
     });
@@ -123,7 +123,7 @@ async fn capture_live(
     let bounds = CaptureBounds {
         time: Duration::from_secs_f64(options.seconds.unwrap_or(SECONDS)),
         bytes: options.bytes.unwrap_or(BYTES).0 as usize,
-        messages: RECORDED,
+        messages: MAX_RECORDED,
     };
     send_step(
         events,
@@ -162,7 +162,7 @@ fn check(options: &CalibrationOptions) -> Result<(), Error> {
     }
     positive("rate", options.rate, 0.01, 10_000.0)?;
     positive("seconds", options.seconds, 0.1, LONGEST)?;
-    positive("keep", options.keep, 0.1, KEPT)?;
+    positive("keep", options.keep, 0.1, MAX_KEEP_TIME)?;
     let memory = options.memory.map(|memory| memory.0 as f64);
     positive("memory", memory, LEAST_MEMORY, f64::MAX)?;
     positive("network", options.network, 0.0, 3_600_000.0)?;

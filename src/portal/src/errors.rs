@@ -300,7 +300,7 @@ impl Error {
 }
 
 /// Default of `Retry-After` in seconds.
-const RETRY_AFTER: u64 = 10;
+const DEFAULT_RETRY_DELAY: u64 = 10;
 
 /// Status, kind and title of a problem.
 type Kind = (StatusCode, &'static str, &'static str);
@@ -355,7 +355,7 @@ impl Error {
             }
             (_, Some(choreographer::Error::BackOff { again, .. })) => choreographer::seconds(*again),
             (Error::RecordedLately { again, .. }, _) => *again,
-            _ => RETRY_AFTER,
+            _ => DEFAULT_RETRY_DELAY,
         };
         problem.retry_after = again.contains(&status).then_some(after);
         problem

@@ -30,7 +30,7 @@ pub use request::ExecQuery;
 use session::ExecOutcome;
 
 /// Limit on the exec sessions of one principal. A servant has its own limit.
-const MOST: usize = 4;
+const MAX_SESSIONS: usize = 4;
 
 /// Runs a program in a servant and upgrades to a WebSocket with its streams.
 pub async fn open_exec(
@@ -53,8 +53,8 @@ pub async fn open_exec(
     handle.check_container()?;
     let container = handle.container().ok_or_else(|| Error::NotRunning(id.clone()))?;
     let who = &caller.who.principal.name;
-    let slot = app.execs.acquire(who.clone(), MOST);
-    let slot = slot.ok_or_else(|| Error::TooManyExecs { who: who.clone(), most: MOST })?;
+    let slot = app.execs.acquire(who.clone(), MAX_SESSIONS);
+    let slot = slot.ok_or_else(|| Error::TooManyExecs { who: who.clone(), most: MAX_SESSIONS })?;
     let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
         return Err(Error::BadRequest("this connection cannot become a WebSocket".to_owned()));
     };

@@ -24,7 +24,7 @@ const UNHEARD: &str = "unknown sender";
 /// Average interval between such events of a servant; those in excess are only counted.
 const PAUSE: Duration = Duration::from_secs(1);
 /// Number of goals ending at once that are reported individually.
-const FEW: usize = 5;
+const MAX_SINGLE_REPORTS: usize = 5;
 /// Time by which a goal may arrive after its result, because they come over two connections.
 const SETTLES: Duration = Duration::from_millis(200);
 
@@ -133,7 +133,7 @@ pub fn report_ended_goals(app: &Arc<App>, handle: &Handle, goals: &Arc<GoalMonit
 fn take_latest(mut all: Vec<observe::ObservedGoal>, before: &mut u64, count: u64) -> (u64, Vec<observe::ObservedGoal>) {
     let last = all.last().and_then(|goal| goal.ended.as_ref());
     let count = last.map_or(count, |(_, outcome)| outcome.number.max(count));
-    let few = all.split_off(all.len().saturating_sub(FEW));
+    let few = all.split_off(all.len().saturating_sub(MAX_SINGLE_REPORTS));
     let more = (count - *before).saturating_sub(few.len() as u64);
     *before = count;
     (more, few)

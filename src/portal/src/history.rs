@@ -22,7 +22,7 @@ use crate::query::Query;
 pub use recorder::record_history;
 
 /// Limit on the samples in a response, over all servants.
-const MOST: usize = 20_000;
+const MAX_SAMPLES: usize = 20_000;
 /// Limit on the servants examined for a response.
 const SERVANTS: u32 = 1_000;
 
@@ -127,7 +127,7 @@ pub async fn servants(
     };
     let mut found = app.state.recorded_series(filter, asked.from, SERVANTS)?;
     found.retain(|one| one.servant != recorder::THE_MACHINE);
-    let mut left = MOST;
+    let mut left = MAX_SAMPLES;
     let mut told = Vec::new();
     for one in found {
         let history = history(&app, one, &asked, left)?;
@@ -135,7 +135,8 @@ pub async fn servants(
         told.push(history);
         if left == 0 {
             return Err(Error::BadRequest(format!(
-                "that is more than {MOST} points in time; ask for one servant, one robot, or a shorter time (from, to)"
+                "that is more than {MAX_SAMPLES} points in time; ask for one servant, one robot, or a shorter time \
+                 (from, to)"
             )));
         }
     }
@@ -176,7 +177,7 @@ pub async fn machine(State(app): State<Arc<App>>, Query(when): Query<TimeQuery>)
     let mut samples = Vec::new();
     for one in app.state.recorded_series(filter, asked.from, 1)? {
         let when = (asked.from, asked.to);
-        samples = app.state.samples(one.id, asked.step.seconds, when, MOST)?;
+        samples = app.state.samples(one.id, asked.step.seconds, when, MAX_SAMPLES)?;
     }
     Ok(Json(MachineHistory { step: asked.step.seconds, figures: figures::machine_figures(&samples) }))
 }

@@ -12,11 +12,11 @@
 
 #![deny(unsafe_code)]
 
-mod allowed;
 mod api_v1;
 mod app;
 mod audit;
 mod auth;
+mod authorisation;
 mod bases;
 mod body;
 mod calibration;
@@ -100,7 +100,7 @@ pub use tokens::{TokenError, Tokens};
 pub fn router(app: Arc<App>) -> Router {
     let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
         let row = (Arc::clone(&app), route.access, routes::words::describe_request as DescribeRequest);
-        let allowed = axum::middleware::from_fn_with_state(row, allowed::authorise);
+        let allowed = axum::middleware::from_fn_with_state(row, authorisation::authorise);
         router.route(route.path, (route.handler)().layer(allowed))
     });
     served

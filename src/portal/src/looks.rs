@@ -13,7 +13,7 @@ use crate::errors::Error;
 use crate::{explain, views};
 
 /// Minimum interval over which processor time is meaningful.
-const MEASURED: Duration = Duration::from_millis(900);
+const MIN_CPU_INTERVAL: Duration = Duration::from_millis(900);
 
 /// Samples servants repeatedly and computes usage since the previous sample.
 #[derive(Default)]
@@ -70,7 +70,7 @@ fn measure(served: &mut Served, measured: &mut HashMap<String, CpuMeasurement>, 
     };
     let last = measured.entry(served.servant.id.clone()).or_insert(new);
     let passed = now.duration_since(last.at);
-    if passed >= MEASURED {
+    if passed >= MIN_CPU_INTERVAL {
         let share = |now: u64, then: u64| now.saturating_sub(then) as f64 / passed.as_micros() as f64;
         *last = CpuMeasurement {
             cores: share(new.cpu_usec, last.cpu_usec),

@@ -2,6 +2,7 @@
 //! with the output.
 
 mod exposition;
+mod process;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +11,7 @@ use api::Phase;
 use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
-use bridge::Metrics;
+use bridge::MetricsSnapshot;
 
 use crate::app::App;
 use crate::errors::Error;
@@ -106,7 +107,18 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
     }
     let exists = |name: &str| services.iter().any(|service| service == name);
     app.choreographer.request_times().write_prometheus(&mut out, exists);
-    write_usage_metrics(&mut out, &app.choreographer.servants()).await;
+    let servants = app.choreographer.servants();
+    write_usage_metrics(&mut out, &servants).await;
+    let memory = app.choreographer.memory();
+    let work = servants.iter().map(|handle| (servant_labels(handle), memory.servant(&handle.id).work_time()));
+    write_family(
+        &mut out,
+        "cloudroid_servant_daemon_seconds_total",
+        "counter",
+        "The daemon's processor time for a servant.",
+        work.map(|(labels, time)| (labels, time.as_secs_f64())),
+    );
+    process::write_process_metrics(&mut out);
     let (kind, text) =
         if accepts_open_metrics(&headers) { (OPEN_METRICS, to_open_metrics(&out)) } else { (PROMETHEUS, out) };
     Ok(([(header::CONTENT_TYPE, kind)], text).into_response())
@@ -162,20 +174,20 @@ fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
     let connections =
         connections.into_iter().map(|(service, count)| (format_labels(&[("service", &service)]), count as f64));
     write_gauge(out, "cloudroid_connections", "Connections of robots.", connections);
-    let bridges: Vec<_> = handles.iter().filter_map(|handle| Some((servant_labels(handle), handle.reach()?))).collect();
-    let messages = bridges.iter().flat_map(|(of, reach)| {
-        let metrics = reach.metrics();
+    let metrics = |handle: &Arc<Handle>| Some((servant_labels(handle), handle.reach()?.metrics()));
+    let bridges: Vec<_> = handles.iter().filter_map(metrics).collect();
+    let messages = bridges.iter().flat_map(|(of, metrics)| {
         [
-            (format!("{of},direction=\"in\""), metrics.frames_in.get() as f64),
-            (format!("{of},direction=\"out\""), metrics.frames_out.get() as f64),
+            (format!("{of},direction=\"in\""), metrics.frames_in as f64),
+            (format!("{of},direction=\"out\""), metrics.frames_out as f64),
         ]
     });
     write_family(out, "cloudroid_messages_total", "counter", "WebSocket messages of robots.", messages);
-    let dropped = bridges.iter().map(|(of, reach)| (of.clone(), reach.dropped_count() as f64));
+    let dropped = bridges.iter().map(|(of, metrics)| (of.clone(), metrics.dropped_count() as f64));
     write_family(out, "cloudroid_dropped_total", "counter", "Messages dropped because someone was slow.", dropped);
     // All rows of a counter must be adjacent.
-    let told: Vec<_> = bridges.iter().map(|(of, reach)| (of, reach.metrics().all())).collect();
-    for (at, (name, help, _)) in Metrics::default().all().into_iter().enumerate() {
+    let told: Vec<_> = bridges.iter().map(|(of, metrics)| (of, metrics.all())).collect();
+    for (at, (name, help, _)) in MetricsSnapshot::default().all().into_iter().enumerate() {
         let rows = told.iter().map(|(of, all)| ((*of).clone(), all[at].2 as f64));
         write_family(out, name, "counter", help, rows);
     }

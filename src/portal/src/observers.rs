@@ -123,11 +123,7 @@ async fn start_observers(app: &App, handle: &Handle, reach: &dyn Reach) -> Optio
 /// Joins a servant's ROS in order to observe it.
 pub(crate) async fn observed_servant(reach: &dyn Reach) -> Option<ObservedServant> {
     let looked = reach.open_inside().await.ok()?;
-    Some(ObservedServant {
-        bus: Arc::clone(&looked.bus),
-        registry: Arc::clone(&looked.registry),
-        held: Box::new(looked),
-    })
+    Some(ObservedServant { bus: looked.bus, registry: looked.registry, held: looked.held })
 }
 
 /// Records the servant if the request took longer than its robot accepts.

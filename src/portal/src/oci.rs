@@ -111,7 +111,7 @@ pub async fn blob(
 }
 
 /// Any other path; pushing through this interface is not supported.
-pub async fn unsupported(OriginalUri(uri): OriginalUri) -> Response {
+pub async fn refuse_unsupported(OriginalUri(uri): OriginalUri) -> Response {
     error_response(
         StatusCode::NOT_FOUND,
         "UNSUPPORTED",

@@ -27,14 +27,14 @@ const BASE: &str = "/api/v1";
 const JSON: &str = "application/json";
 const EVENT_STREAM: &str = "text/event-stream";
 const HTML: &str = "text/html";
-const ABOUT: &str = "API of cloudroidd for cloudroidctl and the portal's page. Robots connect to \
+const DESCRIPTION: &str = "API of cloudroidd for cloudroidctl and the portal's page. Robots connect to \
     ws://host:port/SERVICE?robot=ID instead, which speaks rosbridge v2. Images are served read-only at /v2/ (OCI \
     distribution).";
 
 type AnySchema = RefOr<Schema>;
 
 /// Descriptions of the refusals, by status.
-const REFUSED: &[(u16, &str)] = &[
+const REFUSALS: &[(u16, &str)] = &[
     (400, "The request is invalid."),
     (401, "No valid token, certificate or session."),
     (403, "Not permitted."),
@@ -53,11 +53,11 @@ const REFUSED: &[(u16, &str)] = &[
 /// Refusals of any operation.
 const ANY: &[u16] = &[400, 401, 403, 429, 500];
 /// Refusals of operations whose path names an object.
-const NAMED: &[u16] = &[404];
+const NAMED_OBJECT_REFUSALS: &[u16] = &[404];
 /// Refusals of operations that read a body.
 const WITH_BODY: &[u16] = &[408, 413, 503];
 /// Further refusals of operations, by operation id.
-const MORE: &[(&str, &[u16])] = &[
+const FURTHER_REFUSALS: &[(&str, &[u16])] = &[
     ("base", &[422]),
     ("bases", &[422]),
     ("calibrate", &[409]),
@@ -231,9 +231,9 @@ impl Operation {
 
 /// Returns the statuses with which an operation at this path may be refused.
 fn refusals(path: &str, operation: &Operation) -> BTreeSet<u16> {
-    let named = if path.contains('{') { NAMED } else { &[] };
+    let named = if path.contains('{') { NAMED_OBJECT_REFUSALS } else { &[] };
     let body = if operation.reads_body { WITH_BODY } else { &[] };
-    let more = MORE.iter().filter(|(id, _)| *id == operation.id);
+    let more = FURTHER_REFUSALS.iter().filter(|(id, _)| *id == operation.id);
     let more = more.flat_map(|(_, statuses)| *statuses);
     let all = ANY.iter().chain(named).chain(body).chain(more);
     all.copied().collect()
@@ -265,7 +265,7 @@ fn document(routes: &[Route]) -> OpenApi {
     Problem::schemas(&mut schemas);
     components.schemas.extend(schemas);
     components.schemas.insert(Problem::name().into_owned(), problem);
-    for (status, words) in REFUSED {
+    for (status, words) in REFUSALS {
         let all = refusal(words, false);
         components.responses.insert(name_of_refusal(*status), all.into());
     }
@@ -278,7 +278,7 @@ fn document(routes: &[Route]) -> OpenApi {
         let operation = operation();
         let statuses = refusals(path, &operation);
         let Operation { mut built, schemas, .. } = operation;
-        for (status, words) in REFUSED {
+        for (status, words) in REFUSALS {
             if !statuses.contains(status) {
                 continue;
             }
@@ -306,7 +306,7 @@ fn document(routes: &[Route]) -> OpenApi {
     components.add_security_scheme("query", SecurityScheme::ApiKey(token));
     let none: [&str; 0] = [];
     OpenApiBuilder::new()
-        .info(InfoBuilder::new().title("Cloudroid").version("1").description(Some(ABOUT)))
+        .info(InfoBuilder::new().title("Cloudroid").version("1").description(Some(DESCRIPTION)))
         .servers(Some([Server::new(BASE)]))
         .security(Some([
             SecurityRequirement::new("bearer", none),

@@ -9,7 +9,7 @@ use include_dir::{Dir, include_dir};
 use crate::errors::Error;
 
 /// Empty if cargo was run without make.
-static BUILT: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/../../web/dist");
+static BUILT_PAGE: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/../../web/dist");
 
 const INDEX: &str = "index.html";
 /// Placeholder for a page that was not built.
@@ -51,13 +51,13 @@ pub async fn asset(Path(name): Path<String>, headers: HeaderMap) -> Response {
 /// Returns a file in the smallest form that the client accepts.
 fn file(path: &str, headers: &HeaderMap, kept: &'static str) -> Option<Response> {
     let compressed = |(encoding, ending): (&'static str, &str)| {
-        let file = BUILT.get_file(format!("{path}{ending}"))?;
+        let file = BUILT_PAGE.get_file(format!("{path}{ending}"))?;
         accepts_encoding(headers, encoding).then_some((file, Some(encoding)))
     };
     let found = ENCODINGS.into_iter().find_map(compressed);
     let (file, encoding) = match found {
         Some(found) => found,
-        None => (BUILT.get_file(path)?, None),
+        None => (BUILT_PAGE.get_file(path)?, None),
     };
     Some(answer(path, kept, file.contents(), encoding))
 }
@@ -142,7 +142,7 @@ mod tests {
 
     #[tokio::test]
     async fn all_that_was_built_is_answered_as_what_it_is() {
-        let assets = BUILT.get_dir("assets").into_iter().flat_map(Dir::files);
+        let assets = BUILT_PAGE.get_dir("assets").into_iter().flat_map(Dir::files);
         for file in assets {
             let name = file.path().file_name().and_then(|name| name.to_str());
             let name = name.expect("a name of ASCII");

@@ -9,7 +9,7 @@ use std::os::fd::{AsFd, AsRawFd};
 /// except SPARC and PA-RISC.
 const SO_PEERGROUPS: libc::c_int = 59;
 /// Maximum number of groups of a process (setgroups(2)).
-const MOST: usize = 65_536;
+const MAX_GROUPS: usize = 65_536;
 
 /// Returns the groups that the process had when it connected.
 pub fn peer_groups(stream: &impl AsFd) -> io::Result<Vec<libc::gid_t>> {
@@ -34,7 +34,7 @@ pub fn peer_groups(stream: &impl AsFd) -> io::Result<Vec<libc::gid_t>> {
         }
         let error = io::Error::last_os_error();
         // If the buffer is too small, the kernel returns the size needed.
-        if error.raw_os_error() != Some(libc::ERANGE) || needed <= groups.len() || needed > MOST {
+        if error.raw_os_error() != Some(libc::ERANGE) || needed <= groups.len() || needed > MAX_GROUPS {
             return Err(error);
         }
         groups.resize(needed, 0);

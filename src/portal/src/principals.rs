@@ -31,7 +31,7 @@ use stored::{KnownAccount, KnownSession, KnownToken};
 pub use stored::{SessionLifetimes, StoredPrincipals};
 
 /// Minimum interval at which a token's last use is written.
-const USED: Millis = 60_000;
+const USE_INTERVAL: Millis = 60_000;
 
 /// All principals, their credentials and the policy.
 pub struct Principals {
@@ -189,7 +189,7 @@ impl Principals {
         let stored = self.stored.read();
         let due = stored.find_token(id).is_some_and(|known| {
             let last = known.last_used.load(Ordering::Relaxed);
-            now.saturating_sub(last) >= USED
+            now.saturating_sub(last) >= USE_INTERVAL
                 && known.last_used.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);
@@ -204,7 +204,7 @@ impl Principals {
         let due = stored.find_session(id).is_some_and(|known| {
             known.last_used.fetch_max(now, Ordering::Relaxed);
             let last = known.written.load(Ordering::Relaxed);
-            now.saturating_sub(last) >= USED
+            now.saturating_sub(last) >= USE_INTERVAL
                 && known.written.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);

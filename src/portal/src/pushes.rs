@@ -15,9 +15,9 @@ use push::RunningPush;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use crate::allowed::conceal_missing;
 use crate::app::App;
 use crate::audit::AuditObject;
+use crate::authorisation::conceal_missing;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::json::{JsonResult, json_lines};

@@ -32,7 +32,7 @@ const DIRECTORY: &str = "recordings";
 /// Name of the file being written.
 const HALF: &str = "half.mcap";
 /// Event kind: a recording was written.
-const RECORDED: &str = "recorded";
+const RECORDED_EVENT: &str = "recorded";
 /// Event kind: a recording could not be written.
 pub const NOT_RECORDED: &str = "not-recorded";
 
@@ -113,7 +113,7 @@ pub async fn write_recording(app: &Arc<App>, handle: &Handle, why: &str) -> Resu
         api::count(record.messages, "message")
     );
     let journal = app.choreographer.journal();
-    journal.info(RECORDED, &words, &event_subject(handle));
+    journal.info(RECORDED_EVENT, &words, &event_subject(handle));
     Ok(to_api_recording(record))
 }
 
@@ -137,20 +137,31 @@ async fn admit_recording(app: &App, handle: &Handle, record: &RecordingRecord) -
         });
     }
     let known = app.state.recordings()?;
-    for number in files_to_evict(&known, record, options) {
+    let evicted = files_to_evict(&known, record, options).ok_or_else(|| Error::NotRecorded {
+        servant: handle.id.clone(),
+        reason: format!(
+            "the file has {}, and the recordings of services that use less leave no room for it in the {} of all (disk \
+             and files in [black_box]); remove some (cloudroidctl recordings rm)",
+            api::Size(record.bytes),
+            api::Size(options.disk)
+        ),
+    })?;
+    for number in evicted {
         forget_recording(app, number).await?;
     }
     Ok(app.state.add_recording(record)?)
 }
 
-/// Returns the files to remove for a new one. `known` lists the existing files, newest first.
-fn files_to_evict(known: &[RecordingRecord], new: &RecordingRecord, options: &BlackBoxOptions) -> Vec<u64> {
+/// Returns the files to remove for a new one, or `None` if that is not to be kept. `known` lists the existing files,
+/// newest first.
+fn files_to_evict(known: &[RecordingRecord], new: &RecordingRecord, options: &BlackBoxOptions) -> Option<Vec<u64>> {
     fn file(one: &RecordingRecord) -> QuotaFile<'_> {
         QuotaFile { owner: "", service: &one.service, bytes: one.bytes }
     }
     let files: Vec<QuotaFile<'_>> = known.iter().map(file).collect();
     let quota = Quota { files: options.files, bytes: options.disk };
-    find_files_to_evict(&files, file(new), quota).into_iter().map(|place| known[place].id).collect()
+    let evicted = find_files_to_evict(&files, file(new), quota)?;
+    Some(evicted.into_iter().map(|place| known[place].id).collect())
 }
 
 fn directory(app: &App) -> PathBuf {

@@ -39,7 +39,8 @@ const TRY_AGAIN_LATER: u16 = 1013;
 /// Close code for a policy violation.
 const POLICY: u16 = 1008;
 /// Close reason for a client that was not authenticated in time.
-const CROWDED: &str = "too many unauthenticated connections; send the auth message sooner, or a token in the address";
+const CROWDED_REASON: &str =
+    "too many unauthenticated connections; send the auth message sooner, or a token in the address";
 /// Bytes that a stub may send before its servant is ready.
 const STUB_AHEAD: usize = 64 * 1024;
 /// Queue size of messages about a waiting robot's position.
@@ -74,7 +75,7 @@ pub async fn service_with_slash(
     caller: Extension<Caller>,
     request: Request,
 ) -> Response {
-    if names::RESERVED.contains(&service.as_str()) {
+    if names::RESERVED_NAMES.contains(&service.as_str()) {
         let path = request.uri().path().to_owned();
         return Error::UnknownPath { path }.into_response();
     }
@@ -424,7 +425,7 @@ async fn serve_session(
         let awaited = recognise(&app, &caller, &mut io, read_ahead);
         let recognised = tokio::select! {
             recognised = awaited => recognised,
-            () = wait_until_dropped(connection.as_ref()) => Err((TRY_AGAIN_LATER, CROWDED.to_owned())),
+            () = wait_until_dropped(connection.as_ref()) => Err((TRY_AGAIN_LATER, CROWDED_REASON.to_owned())),
         };
         match recognised {
             Ok((who, rest)) => {
@@ -583,10 +584,10 @@ async fn serve_stub(
     let (robot, node) = (asked.robot.as_deref().unwrap_or_default(), &*asked.node);
     let servant = lease.handle().span(Span::current().id());
     let span = tracing::error_span!(parent: &servant, "link", robot, node);
+    let end = Box::pin(app.principals.wait_for_end(&caller.who, &asked.service, true));
     let lost = tokio::select! {
-        lost = reach.serve_link(io, &read_ahead).instrument(span) => lost.to_string(),
+        lost = reach.serve_link(io, &read_ahead, end).instrument(span) => lost,
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
-        reason = app.principals.wait_for_end(&caller.who, &asked.service, true) => reason,
     };
     tracing::info!("the link of {robot} to servant {} ended: {lost}", lease.handle().id);
 }

@@ -553,7 +553,7 @@ pub const ROUTES: &[Route] = &[
 /// Responds to paths without a route: 404.
 pub async fn not_found(uri: OriginalUri) -> Response {
     if uri.path().starts_with("/v2/") {
-        return oci::unsupported(uri).await;
+        return oci::refuse_unsupported(uri).await;
     }
     Error::UnknownPath { path: uri.path().to_owned() }.into_response()
 }

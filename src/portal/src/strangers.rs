@@ -34,7 +34,7 @@ const SHARE: u64 = 4;
 /// The current strangers.
 #[derive(Debug)]
 pub struct Strangers {
-    /// By an increasing number: the first is the oldest.
+    /// Strangers by an increasing number: the first is the oldest.
     present: Mutex<BTreeMap<u64, PresentStranger>>,
     most: usize,
     came: AtomicU64,

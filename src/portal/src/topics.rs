@@ -22,7 +22,7 @@ use crate::json::json_lines;
 use crate::observers;
 
 /// Period of one line.
-const EACH: Duration = Duration::from_secs(1);
+const LINE_PERIOD: Duration = Duration::from_secs(1);
 
 /// Streams the statistics of all topics, one line per second.
 pub async fn topics(
@@ -50,7 +50,7 @@ pub async fn topics(
         let service = handle.service().to_owned();
         let told = async {
             loop {
-                tokio::time::sleep(EACH).await;
+                tokio::time::sleep(LINE_PERIOD).await;
                 // The servant has ended, or another has its id.
                 let ended = app.choreographer.servant(&id).is_err();
                 // Checked each time because rules may have changed.

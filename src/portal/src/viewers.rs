@@ -63,10 +63,10 @@ pub async fn viewer(
         let servant = async {
             let looked = looker.reach.open_inside().await;
             looked.map(|looked| viewer::ViewedServant {
-                bus: Arc::clone(&looked.bus),
-                registry: Arc::clone(&looked.registry),
-                ended: looked.ended.clone(),
-                held: Box::new(looked),
+                bus: looked.bus,
+                registry: looked.registry,
+                ended: looked.ended,
+                held: looked.held,
             })
         };
         viewer::serve(io, read_ahead, servant, options).await;

@@ -158,6 +158,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
     let (warm_pool, warm_nodes) = app.choreographer.warm_pool();
     Ok(Status {
         version: env!("CARGO_PKG_VERSION").to_owned(),
+        architecture: std::env::consts::ARCH.to_owned(),
         pid: std::process::id(),
         home: app.home.display().to_string(),
         listen: app.listen.to_string(),

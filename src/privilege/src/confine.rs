@@ -12,7 +12,7 @@ use crate::Error;
 pub const DEFAULT_USER: u32 = 65521;
 
 /// Capabilities that the daemon keeps for the engine's threads and the programs that these start.
-pub const KEPT: [Capability; 16] = [
+pub const KEPT_CAPABILITIES: [Capability; 16] = [
     // Trees of builds and layers: owners, modes, set-user-id bits and file capabilities of packages.
     Capability::CAP_CHOWN,
     Capability::CAP_DAC_OVERRIDE,
@@ -79,10 +79,10 @@ fn capabilities_error(action: &'static str) -> impl FnOnce(caps::errors::CapsErr
     move |source| Error::Capabilities { action, source }
 }
 
-/// Removes all capabilities but [`KEPT`] from the calling thread and the threads it starts; programs they execute
-/// cannot regain others. Must be called before the process has other threads.
+/// Removes all capabilities but [`KEPT_CAPABILITIES`] from the calling thread and the threads it starts; programs they
+/// execute cannot regain others. Must be called before the process has other threads.
 pub fn limit_capabilities() -> Result<(), Error> {
-    let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
+    let kept: CapsHashSet = KEPT_CAPABILITIES.into_iter().chain([KEPT_IF_THERE]).collect();
     set_capabilities(&kept)
 }
 

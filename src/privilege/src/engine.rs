@@ -55,7 +55,7 @@ pub fn confined_account() -> Option<Account> {
     ENGINE.get().map(|(_, account)| *account)
 }
 
-/// On the engine's threads, returns the account of the confined threads.
+/// Returns the account of the confined threads, on the engine's threads.
 pub(crate) fn account_on_engine() -> Option<Account> {
     OF_ENGINE.get().then(confined_account).flatten()
 }

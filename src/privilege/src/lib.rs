@@ -4,7 +4,7 @@
 //! ```text
 //!   portal's threads: HTTP, WebSocket, bridge,       engine's threads: containers, image store,
 //!   links, buses, choreographer, database            builds, files below the home
-//!     no capability, a user of their own     ──run, spawn_blocking, run_sync──▶ root, the capabilities in `KEPT`
+//!     no capability, a user of their own     ──run, spawn_blocking, run_sync──▶ root, `KEPT_CAPABILITIES`
 //!                                                                   └─run_as_reader─▶ a reader: reads every file
 //! ```
 //!
@@ -16,7 +16,7 @@ mod confine;
 mod engine;
 mod reading;
 
-pub use confine::{Account, DEFAULT_USER, KEPT, confine, limit_capabilities, retain_capabilities};
+pub use confine::{Account, DEFAULT_USER, KEPT_CAPABILITIES, confine, limit_capabilities, retain_capabilities};
 pub use engine::{Engine, Task, confined_account, run, run_sync, spawn_blocking};
 pub use reading::{run_as_reader, spawn_reader};
 
@@ -50,7 +50,7 @@ pub enum Error {
         /// Description of the remaining privileges.
         left: String,
     },
-    /// Not a user, or not one that can be used.
+    /// No such user exists, or it cannot be used.
     #[error("portal_user = {written:?} is not a user of this machine, nor the number of one other than root")]
     Unknown {
         /// Value in the configuration.

@@ -14,8 +14,8 @@ use image::ArchiveKind;
 use rootfs_builder::{BaseImport, BaseReport, Builder, ImportSource, blocking};
 use tokio::sync::mpsc;
 
+use super::deployer_text::{TREE_DIRECTORY, to_push_error};
 use super::reporter::Reporter;
-use super::told::{PUSHED, to_push_error};
 use super::{Archive, Error, Pusher, receive};
 use store::NewEvent;
 
@@ -84,6 +84,7 @@ impl Pusher {
                 outcome = tokio::time::timeout(limit, blocking::cancellable(receiving)) => {
                     outcome.unwrap_or_else(|_| Err(too_long_error(limit)))
                 }
+                error = pusher.disks.wait_until_low() => Err(error),
                 () = pusher.cancel.cancelled() => Err(Error::Ending),
             };
             let removed = privilege::spawn_blocking(move || foreign::remove(&directory)).await;
@@ -118,7 +119,7 @@ impl Pusher {
 
     async fn receive_base(&self, archive: Archive, directory: &Path) -> Result<String, Error> {
         self.disks.check().await?;
-        let tree = directory.join(PUSHED);
+        let tree = directory.join(TREE_DIRECTORY);
         // Nobody listens to the progress: the client knows how much it has sent.
         let (events, _) = mpsc::channel(1);
         receive::unpack(archive, &tree, &self.options, &Reporter::new(events)).await?;
@@ -134,7 +135,7 @@ impl Pusher {
             self.discard(archive);
             return Err(error);
         }
-        let tree = directory.join(PUSHED);
+        let tree = directory.join(TREE_DIRECTORY);
         let (events, _) = mpsc::channel(1);
         let report = Reporter::new(events);
         let (kind, archive) = receive::detect_kind(archive, &self.options).await?;

@@ -24,7 +24,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// space in it.
 const MEASURE_EVERY: Duration = Duration::from_secs(10);
 /// Minimum size counted for each file, in bytes, for its inode, name and block.
-const LEAST: u64 = 4 << 10;
+const MIN_FILE_SIZE: u64 = 4 << 10;
 
 /// Remaining time and disk space of a push. Time spent waiting does not count.
 pub(super) struct PushBudget<'a> {
@@ -122,7 +122,7 @@ fn measure_tree(directory: PathBuf, most: u64) -> Result<u64, foreign::Error> {
                 rustix::fs::FileType::RegularFile => u64::try_from(stat.st_size).unwrap_or(0),
                 _ => 0,
             };
-            total = total.saturating_add(blocks.max(size).max(LEAST));
+            total = total.saturating_add(blocks.max(size).max(MIN_FILE_SIZE));
         }
         let enough = total > most;
         Ok::<_, foreign::Error>(if enough { Visit::Skip } else { Visit::Into })
@@ -182,7 +182,7 @@ mod tests {
             std::fs::write(place.path().join(number.to_string()), "").expect("written");
         }
         let before = measure_tree(place.path().to_owned(), u64::MAX).expect("measured");
-        assert!(before >= 11 * LEAST, "{before}");
+        assert!(before >= 11 * MIN_FILE_SIZE, "{before}");
         let first = place.path().join("0");
         std::fs::write(&first, vec![1; 1 << 20]).expect("written");
         for number in 0..10 {
@@ -190,6 +190,6 @@ mod tests {
         }
         let after = measure_tree(place.path().to_owned(), u64::MAX).expect("measured");
         let grown = after - before;
-        assert!(((1 << 20) - LEAST..2 << 20).contains(&grown), "{grown}");
+        assert!(((1 << 20) - MIN_FILE_SIZE..2 << 20).contains(&grown), "{grown}");
     }
 }

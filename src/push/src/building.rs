@@ -1,4 +1,4 @@
-//! From what was received to an image: it is looked at, waits for its place, and is built or imported.
+//! Builds an image of what was received: it is inspected, waits for its turn, and is built or imported.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -12,10 +12,10 @@ use rootfs_builder::{
 use store::UnderlayRecord;
 use tokio::sync::mpsc;
 
-use super::exported::ImportedService;
 use super::pusher::EVENTS_AHEAD;
 use super::reporter::Reporter;
-use super::{Deployer, Error, Pusher, exported, receive, told};
+use super::service_record::ImportedService;
+use super::{Deployer, Error, Pusher, deployer_text, receive, service_record};
 
 impl Pusher {
     /// Looks at what was received: a service that another server has exported, or something to build.
@@ -35,7 +35,7 @@ impl Pusher {
             }
             PushSource::Tree(tree) => {
                 let of = tree.clone();
-                if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
+                if privilege::spawn_blocking(move || service_record::is_exported(&of)).await.unwrap_or(false) {
                     return Ok(PushedWork::Exported(tree.clone()));
                 }
                 if let Some(name) = &options.name {
@@ -122,7 +122,7 @@ impl Pusher {
         // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).
         let work = privilege::run(report.building.track_future(work(sender)));
         let (done, ()) = tokio::join!(work, forwarded);
-        done.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
+        done.map_err(|error| deployer_text::to_push_error(&error, &self.home, &options.source))
     }
 }
 
@@ -149,7 +149,7 @@ fn build_request(id: &str, options: &PushOptions, source: PushSource) -> PushReq
     }
 }
 
-/// What to do with a push that was looked at.
+/// Next step of an inspected push.
 pub(super) enum PushedWork {
     /// Build it.
     Build(Box<BuildWork>),
@@ -165,7 +165,7 @@ pub(super) struct BuildWork {
     underlays: BTreeMap<String, u64>,
 }
 
-/// What was built or imported, before it is probed or published.
+/// Result of building or importing, before it is probed or published.
 pub(super) enum PushedImage {
     /// The image of a service, with the underlays that it stands on and their revisions.
     Built(Box<(BuildOutcome, BTreeMap<String, u64>)>),

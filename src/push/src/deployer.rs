@@ -13,7 +13,7 @@ type SightCheck = dyn Fn(&str) -> bool + Send + Sync;
 /// Checks whether an underlay of this name, and with this owner if it exists, may be used so.
 type UnderlayCheck = dyn Fn(UnderlayUse, &str, Option<Option<&str>>) -> Result<(), Error> + Send + Sync;
 
-/// What a principal does with an underlay.
+/// Use of an underlay by a principal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnderlayUse {
     /// Builds upon it, or sees it in a list: what seeing a service of its name takes.

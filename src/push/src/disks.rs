@@ -12,7 +12,7 @@ use crate::Error;
 /// Interval at which the free space is checked.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Divisor of the disk size: on small disks 1/20 of the size stays free.
-const PART: u64 = 20;
+const FREE_DIVISOR: u64 = 20;
 
 /// The disks that pushes write to: those of the state directory and of the build cache.
 #[derive(Debug, Clone)]
@@ -54,7 +54,7 @@ impl Disks {
             let about = statvfs(directory).ok()?;
             let size = about.blocks().saturating_mul(about.fragment_size());
             let left = about.blocks_available().saturating_mul(about.fragment_size());
-            let needed = self.free.0.min(size / PART);
+            let needed = self.free.0.min(size / FREE_DIVISOR);
             (left < needed).then(|| {
                 format!(
                     "no space for a push: {} bytes are free on the disk of {}, and {needed} must stay free",
@@ -91,7 +91,7 @@ mod tests {
         let disks = |free| Disks::new(place.path(), place.path(), Size(free));
         disks(0).check().await.expect("nothing is to stay free");
         // At most 1/20 of a disk is required.
-        let full = left < size / PART;
+        let full = left < size / FREE_DIVISOR;
         assert_eq!(disks(u64::MAX).check().await.is_err(), full);
         assert!(!full, "this test needs a disk of which a twentieth is free");
         // A disk that does not exist is not checked.
@@ -124,7 +124,7 @@ mod tests {
         assert_eq!(said.0, None);
         let lacking = said.1.expect("it is full");
         assert!(lacking.contains("no space") && lacking.contains("small"), "{lacking}");
-        assert!(lacking.contains(&format!("{} must stay free", (4 << 20) / PART)), "{lacking}");
+        assert!(lacking.contains(&format!("{} must stay free", (4 << 20) / FREE_DIVISOR)), "{lacking}");
         let words = no_space_error(lacking).message_and_advice();
         assert!(words.contains("lower free or cache"), "{words}");
     }

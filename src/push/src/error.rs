@@ -66,7 +66,7 @@ pub enum Error {
         /// Reason.
         source: serde_json::Error,
     },
-    /// There is nothing to export of a base.
+    /// The base has not been set up, so there is nothing to export.
     #[error("{0}")]
     BaseNotSetUp(String),
     /// The base was not imported.
@@ -168,7 +168,7 @@ pub enum OptionsError {
     UnderlayName {
         /// The option.
         option: &'static str,
-        /// What is wrong with it.
+        /// Reason.
         problem: catalogue::names::NameError,
     },
     /// Options that are about a service.

@@ -8,7 +8,7 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
 use super::reporter::Reporter;
-use super::{Deployer, Pusher, told};
+use super::{Deployer, Pusher, deployer_text};
 
 /// Interval at which the state of an awaited push is read.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -57,7 +57,7 @@ impl Pusher {
                         awaited = None;
                         step.clone_from(title);
                     }
-                    if let Some(event) = told::to_push_event(event) {
+                    if let Some(event) = deployer_text::to_push_event(event) {
                         report.event(event).await;
                     }
                 }

@@ -17,9 +17,9 @@ mod bases;
 mod bounds;
 mod building;
 mod deployer;
+mod deployer_text;
 mod disks;
 mod error;
-mod exported;
 mod forward;
 mod interface_limits;
 mod naming;
@@ -36,10 +36,10 @@ mod reporter;
 mod request;
 mod room;
 mod running;
+mod service_record;
 mod shared;
 mod stateful;
 mod supplement;
-mod told;
 mod underlays;
 
 use std::collections::BTreeMap;
@@ -54,22 +54,22 @@ use rootfs_builder::{BuildOutcome, PushSource};
 
 use bounds::PushBudget;
 use building::PushedImage;
-use exported::ImportedService;
+use deployer_text::TREE_DIRECTORY;
 use places::QueuedPush;
 use pusher::HOME_INSIDE;
 use reporter::Reporter;
+use service_record::ImportedService;
 use store::{Plan, RevisionRecord};
-use told::PUSHED;
 
 pub use bases::NewBase;
 pub use deployer::{Deployer, UnderlayUse};
 pub use error::{Error, OptionsError};
-pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use pusher::{Pusher, PusherParts};
 pub use receive::Archive;
 pub use request::{Published, PushResult};
 pub use running::{PushFollower, ReceptionGuard, RunningPush};
+pub use service_record::{RECORD, ServiceRecord};
 
 impl Pusher {
     /// Receives a push, and runs it when its turn comes, within its budget. `entered` is what counts it among the
@@ -168,7 +168,7 @@ impl Pusher {
             return Ok(PushSource::Packaged(package.clone()));
         }
         report.step("receiving the package").await;
-        let tree = self.home.join("build").join(id).join(PUSHED);
+        let tree = self.home.join("build").join(id).join(TREE_DIRECTORY);
         receive::unpack(archive, &tree, &self.options, report).await?;
         Ok(PushSource::Tree(tree))
     }

@@ -14,6 +14,7 @@ use package::interface::Interface;
 use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::{ProbeError, ProbeOptions, wait_until_still};
+use ros::bus::parameter_names::spell_in_ros2;
 use ros::bus::{Graph, ParamValue, RosVersion};
 use ros::flavour::{Flavour, NodeRename};
 use ros::plumbing;
@@ -37,7 +38,7 @@ const QUIET: Duration = Duration::from_millis(200);
 const MORE_NODES: Duration = Duration::from_secs(2);
 
 /// Maximum number of parameters named in a warning.
-const NAMED: usize = 12;
+const MAX_NAMED_PARAMETERS: usize = 12;
 
 /// Returns the mark of the node at an index of the plan, while names are probed.
 fn mark_for_index(index: usize) -> String {
@@ -402,7 +403,7 @@ fn is_read(interface: &Interface, key: &str, nodes: &[&str]) -> bool {
 /// Names the parameters that were read.
 fn describe_read(interface: &Interface) -> String {
     let read = interface.parameters.iter().filter(|parameter| !parameter.read_by.is_empty());
-    let names: Vec<&str> = read.map(|parameter| parameter.name.as_str()).take(NAMED).collect();
+    let names: Vec<&str> = read.map(|parameter| parameter.name.as_str()).take(MAX_NAMED_PARAMETERS).collect();
     if names.is_empty() { "none was read".to_owned() } else { format!("read were {}", names.join(", ")) }
 }
 
@@ -414,7 +415,7 @@ fn describe_undeclared(interface: &Interface, key: &str) -> Option<String> {
     let is_it = |parameter: &&&package::interface::Parameter| {
         let name = parameter.own_name().unwrap_or_default();
         let below = |whole: &str| {
-            let whole = whole.replace('/', ".");
+            let whole = spell_in_ros2(whole);
             name == whole || name.strip_prefix(&whole).is_some_and(|rest| rest.starts_with('.'))
         };
         match wanted.strip_prefix(&parameter.node) {
@@ -427,7 +428,7 @@ fn describe_undeclared(interface: &Interface, key: &str) -> Option<String> {
         return None;
     }
     let mut names: Vec<&str> = own.iter().map(|it| it.name.as_str()).collect();
-    names.truncate(NAMED);
+    names.truncate(MAX_NAMED_PARAMETERS);
     Some(format!("declared: {}", names.join(", ")))
 }
 

@@ -29,7 +29,7 @@ const DISCARD_FOR: Duration = Duration::from_secs(60);
 /// Maximum depth at which a package.xml is searched.
 const DEPTH: usize = 6;
 /// Name of an archive that is stored as it is.
-const STORED: &str = "archive";
+const ARCHIVE_NAME: &str = "archive";
 /// Maximum size of a package.xml, in bytes.
 const MANIFEST: u64 = 1 << 20;
 
@@ -80,12 +80,12 @@ pub(super) async fn store(
 ) -> Result<PathBuf, Error> {
     let copy = |content: &mut dyn Read, inside: &Path| {
         std::fs::create_dir(inside).map_err(file_error("make", inside))?;
-        let path = inside.join(STORED);
+        let path = inside.join(ARCHIVE_NAME);
         let mut file = File::create_new(&path).map_err(file_error("make", &path))?;
         io::copy(content, &mut file).map(drop).map_err(file_error("write", &path))
     };
     take(archive, directory, limits, report, copy).await?;
-    Ok(directory.join(STORED))
+    Ok(directory.join(ARCHIVE_NAME))
 }
 
 /// Waits for the beginning of an archive and returns its kind, and the whole archive.
@@ -179,7 +179,7 @@ struct UnpackDirectory {
 }
 
 /// Name of the tree in the directory.
-const UNPACKED: &str = "tree";
+const TREE_NAME: &str = "tree";
 
 impl UnpackDirectory {
     fn create(tree: &Path) -> Result<Self, Error> {
@@ -197,12 +197,12 @@ impl UnpackDirectory {
 
     /// Returns the path of the tree for those threads.
     fn confined_path(&self) -> PathBuf {
-        PathBuf::from(format!("/proc/self/fd/{}/{UNPACKED}", self.opened.as_raw_fd()))
+        PathBuf::from(format!("/proc/self/fd/{}/{TREE_NAME}", self.opened.as_raw_fd()))
     }
 
     /// Takes ownership of the tree and moves it to its final path.
     fn finish(self) -> Result<(), Error> {
-        let found = self.path.join(UNPACKED);
+        let found = self.path.join(TREE_NAME);
         if privilege::confined_account().is_some() {
             let failed = file_error("take over", &found);
             chown_tree(&found).map_err(|error| failed(io::Error::other(error)))?;

@@ -12,11 +12,11 @@ use super::running::{CompletedStep, RunningPush};
 use crate::Error;
 
 /// Number of pushes that are kept, the running ones included.
-const MOST: u32 = 100;
+const MAX_PUSHES: u32 = 100;
 /// Maximum length of the description of what is pushed, which its client chooses.
 const LONGEST_SOURCE: usize = 300;
-/// How long an ended push is kept.
-const KEPT_FOR: Duration = Duration::from_secs(14 * 24 * 3600);
+/// Time for which an ended push is kept.
+const RECORD_EXPIRY: Duration = Duration::from_secs(14 * 24 * 3600);
 
 /// All pushes, by number.
 pub(super) struct PushRegistry {
@@ -73,8 +73,8 @@ impl PushRegistry {
     /// Ends a push with its last event.
     pub(super) fn end(&self, push: &RunningPush, event: PushEvent) {
         let (record, output) = push.to_record(&event);
-        let since = store::now().saturating_sub(KEPT_FOR.as_millis() as u64);
-        if let Err(error) = self.state.end_push(&record, &output, MOST, since) {
+        let since = store::now().saturating_sub(RECORD_EXPIRY.as_millis() as u64);
+        if let Err(error) = self.state.end_push(&record, &output, MAX_PUSHES, since) {
             tracing::warn!("the end of push {} is not recorded: {error}", push.number);
         }
         self.running.lock().remove(&push.number);

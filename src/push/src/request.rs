@@ -21,7 +21,7 @@ use super::reporter::Reporter;
 use super::running::RunningPush;
 use super::{Archive, Error, OptionsError, Pusher, option_check, receive, shared};
 
-/// What a push has published, or found unchanged.
+/// Result of a push: a new revision, or the unchanged one.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Published {
     /// The service of this name.
@@ -33,7 +33,7 @@ pub enum Published {
 /// Result of a push.
 #[derive(Debug)]
 pub struct PushResult {
-    /// What was published.
+    /// The published revision.
     pub published: Published,
     /// Layers of the image.
     pub layers: Vec<api::push::Layer>,

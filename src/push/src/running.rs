@@ -17,11 +17,11 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// Maximum size of the events kept of a running push, in bytes.
-const KEPT: usize = 2 << 20;
+const MAX_EVENT_BYTES: usize = 2 << 20;
 /// Size counted for each event besides its text, in bytes.
-const EACH: usize = 64;
+const EVENT_OVERHEAD: usize = 64;
 /// Maximum size of the output that is stored when a push has ended, in bytes.
-const STORED: usize = 256 << 10;
+const MAX_STORED_OUTPUT: usize = 256 << 10;
 /// Maximum length of the reason of a failure in the list of pushes. The output has all of it.
 const LONGEST_MESSAGE: usize = 1000;
 
@@ -220,7 +220,7 @@ impl PushOutput {
         }
         self.bytes += event_size(&event);
         self.kept.push_back(NumberedEvent { number, event });
-        while self.bytes > KEPT && self.kept.len() > 1 {
+        while self.bytes > MAX_EVENT_BYTES && self.kept.len() > 1 {
             // Steps and warnings are few, and tell more than lines.
             let oldest = self.kept.iter().position(|one| matches!(one.event, PushEvent::Log { .. })).unwrap_or(0);
             if let Some(removed) = self.kept.remove(oldest) {
@@ -252,7 +252,7 @@ impl PushOutput {
         for one in self.kept.iter().rev() {
             let line = to_line(&one.event);
             bytes += line.len();
-            if bytes > STORED {
+            if bytes > MAX_STORED_OUTPUT {
                 lines.push(to_line(&removal_mark()));
                 break;
             }
@@ -288,7 +288,7 @@ fn event_size(event: &PushEvent) -> usize {
         | PushEvent::Underlay { .. }
         | PushEvent::Error { .. } => 0,
     };
-    text + EACH
+    text + EVENT_OVERHEAD
 }
 
 /// Reads the output of a push while it grows.
@@ -395,17 +395,17 @@ mod tests {
         let push = push();
         push.add(PushEvent::step("compiling"));
         let line = "x".repeat(1 << 10);
-        for _ in 0..4 * KEPT / line.len() {
+        for _ in 0..4 * MAX_EVENT_BYTES / line.len() {
             push.add(log(&*line));
         }
         push.add(log("the last"));
         let kept = push.output();
-        assert!(kept.iter().map(event_size).sum::<usize>() <= KEPT + 2 * EACH, "{}", kept.len());
+        assert!(kept.iter().map(event_size).sum::<usize>() <= MAX_EVENT_BYTES + 2 * EVENT_OVERHEAD, "{}", kept.len());
         assert!(matches!(&kept[0], PushEvent::Log { line } if line.contains("no longer kept")), "{:?}", kept[0]);
         assert_eq!(kept[1], PushEvent::step("compiling"));
         assert_eq!(kept.last(), Some(&log("the last")));
         let (record, output) = push.to_record(&error());
-        assert!(output.len() < STORED + 10_000, "{}", output.len());
+        assert!(output.len() < MAX_STORED_OUTPUT + 10_000, "{}", output.len());
         assert!(output.lines().all(|line| serde_json::from_str::<PushEvent>(line).is_ok()));
         assert_eq!((record.state, record.message.as_deref()), (PushState::Failed, Some("it broke")));
         let detail = "é".repeat(1 << 20);

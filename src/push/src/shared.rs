@@ -8,7 +8,7 @@ use ros::bus::RosVersion;
 use crate::{Error, OptionsError};
 
 /// Maximum number of servants of a service, and of concurrent calls of a servant.
-const MOST: u32 = 64;
+const MAX_SERVANTS: u32 = 64;
 
 /// Rejects contradictory numbers of servants.
 pub(crate) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
@@ -24,11 +24,11 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
         let replicas = shared.replicas;
         return Err(OptionsError::Replicas { replicas, max });
     }
-    if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
-        return Err(OptionsError::ServantRange { min, max, most: MOST });
+    if !(1..=MAX_SERVANTS).contains(&max) || !(1..=max).contains(&min) {
+        return Err(OptionsError::ServantRange { min, max, most: MAX_SERVANTS });
     }
-    if !(1..=MOST).contains(&shared.calls) {
-        return Err(OptionsError::Calls { calls: shared.calls, most: MOST });
+    if !(1..=MAX_SERVANTS).contains(&shared.calls) {
+        return Err(OptionsError::Calls { calls: shared.calls, most: MAX_SERVANTS });
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use super::reporter::Reporter;
 use super::{Deployer, Error, Pusher, UnderlayUse, api_layer};
 
 /// Maximum number of services that are named.
-const NAMED: usize = 10;
+const MAX_NAMED_SERVICES: usize = 10;
 
 /// Returns the name under which pushes of an underlay are serialized; no service has it.
 pub(super) fn lock_name(name: &str) -> String {
@@ -165,8 +165,8 @@ fn read_contents(record: &UnderlayRecord) -> Result<UnderlayContents, Error> {
 fn name_services(standing: &[StandingService], by: &Deployer) -> Option<String> {
     let (known, others): (Vec<_>, Vec<_>) = standing.iter().partition(|one| (by.may_see)(&one.service));
     let mut names: Vec<String> =
-        known.iter().take(NAMED).map(|one| format!("{} (on revision {})", one.service, one.on)).collect();
-    let more = others.len() + known.len().saturating_sub(NAMED);
+        known.iter().take(MAX_NAMED_SERVICES).map(|one| format!("{} (on revision {})", one.service, one.on)).collect();
+    let more = others.len() + known.len().saturating_sub(MAX_NAMED_SERVICES);
     if more > 0 {
         names.push(api::count(more as u64, "other service"));
     }

@@ -43,6 +43,17 @@ pub enum DeliveryVerdict {
 /// Smallest time after T_max: an answer that arrives exactly at T_max is still in time.
 const PAST: Duration = Duration::from_nanos(1);
 
+/// Requests whose timers have expired.
+#[derive(Debug)]
+pub(crate) struct Expired<P> {
+    /// Requests that may be hedged now ([`Arbiter::schedule_hedge`]); their T_max is still to come.
+    pub(crate) hedges: Vec<RequestId>,
+    /// Requests whose T_max has passed since the last call, and those whose callers still wait.
+    pub(crate) overdue: Vec<RequestId>,
+    /// Requests that are forgotten now.
+    pub(crate) forgotten: Vec<(RequestId, Record<P>)>,
+}
+
 /// The open and recent requests of one node. `P` is the request's payload, cheap to clone.
 #[derive(Debug)]
 pub(crate) struct Arbiter<P> {
@@ -53,7 +64,7 @@ pub(crate) struct Arbiter<P> {
     keyed: HashMap<(Arc<str>, CorrelationKey), RequestId>,
     /// Number of requests without a waiting caller.
     inputs: usize,
-    /// One timer per request ([`Record::timer`]): its T_max, or the end of its patience.
+    /// One timer per request ([`Record::timer`]): its hedge, its T_max, or the end of its patience.
     timers: BTreeSet<(Instant, RequestId)>,
     /// Inputs that were not answered by T_max, oldest first.
     stragglers: VecDeque<RequestId>,
@@ -113,6 +124,15 @@ impl<P: Clone> Arbiter<P> {
         self.timers.insert((record.timer, id));
         self.requests.insert(id, record);
         id
+    }
+
+    /// Lets [`expire`](Self::expire) return the request at `at`, before its T_max.
+    pub(crate) fn schedule_hedge(&mut self, id: RequestId, at: Instant) {
+        if let Some(record) = self.requests.get_mut(&id) {
+            self.timers.remove(&(record.timer, id));
+            record.timer = at;
+            self.timers.insert((at, id));
+        }
     }
 
     /// Returns the request on the channel `name` whose answers carry `key`.
@@ -289,22 +309,24 @@ impl<P: Clone> Arbiter<P> {
         self.inputs > self.limits.requests
     }
 
-    /// Returns the requests whose T_max has passed since the last call, including those whose callers still wait, and
-    /// the requests that are forgotten now. `put_off` returns the time until which a request may still turn out to have
-    /// been left out.
+    /// Returns the requests whose timers have expired. `put_off` returns the time until which a request may still turn
+    /// out to have been left out.
     pub(crate) fn expire(
         &mut self,
         now: Instant,
         put_off: impl Fn(RequestId, &Record<P>) -> Option<Instant>,
-    ) -> (Vec<RequestId>, Vec<(RequestId, Record<P>)>) {
-        let (mut overdue, mut forgotten) = (Vec::new(), Vec::new());
+    ) -> Expired<P> {
+        let (mut hedges, mut overdue, mut forgotten) = (Vec::new(), Vec::new(), Vec::new());
         while let Some((at, id)) = self.timers.first().copied().filter(|(at, _)| *at <= now) {
             self.timers.pop_first();
             let Some(record) = self.requests.get_mut(&id) else {
                 continue;
             };
             let until = put_off(id, record).map(|until| until + PAST);
-            if let Some(until) = until.filter(|until| !record.overdue && *until > now) {
+            if !record.overdue && now <= record.deadline {
+                record.timer = record.deadline + PAST;
+                hedges.push(id);
+            } else if let Some(until) = until.filter(|until| !record.overdue && *until > now) {
                 record.timer = until;
             } else if !record.overdue {
                 record.overdue = true;
@@ -341,7 +363,7 @@ impl<P: Clone> Arbiter<P> {
                 forgotten.extend(self.remove(id).map(|record| (id, record)));
             }
         }
-        (overdue, forgotten)
+        Expired { hedges, overdue, forgotten }
     }
 }
 
@@ -422,12 +444,12 @@ mod tests {
             assert_eq!(arbiter.requests.len(), arbiter.inputs + 1);
             assert_eq!(arbiter.timers.len(), arbiter.requests.len());
         }
-        let (overdue, _) = arbiter.expire(now + MAX, |_, _| None);
-        assert!(overdue.is_empty(), "at T_max it is still in time");
-        let (overdue, _) = arbiter.expire(now + MAX * 2, |_, _| None);
-        assert!(overdue.contains(&call));
-        let (_, forgotten) = arbiter.expire(now + Duration::from_secs(60), |_, _| None);
-        assert!(forgotten.iter().all(|(id, _)| *id != call));
+        let expired = arbiter.expire(now + MAX, |_, _| None);
+        assert!(expired.overdue.is_empty(), "at T_max it is still in time");
+        let expired = arbiter.expire(now + MAX * 2, |_, _| None);
+        assert!(expired.overdue.contains(&call));
+        let expired = arbiter.expire(now + Duration::from_secs(60), |_, _| None);
+        assert!(expired.forgotten.iter().all(|(id, _)| *id != call));
         assert_eq!(arbiter.requests.len(), 1);
     }
 }

@@ -1,11 +1,14 @@
 //! Quality of service of one node of the package: combines all parts of this crate.
 
+mod arrivals;
 mod asking;
 mod effect;
 mod frames;
 mod giving_up;
+mod hedging;
 mod judging;
 mod original;
+mod output_age;
 mod queue;
 mod standing;
 mod stream;
@@ -14,7 +17,7 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::arbiter::{Arbiter, DeliveryVerdict, Kind, Record, RetentionLimits};
+use crate::arbiter::{Arbiter, DeliveryVerdict, Expired, Kind, Record, RetentionLimits};
 use crate::channel::RequestChannel;
 use crate::decider::{Decider, LocalState, QosEvent};
 use crate::measure::Meter;
@@ -27,6 +30,7 @@ use crate::sla::{Mode, QosSla};
 
 pub use effect::Effect;
 use frames::OutputMeters;
+pub use output_age::OutputAge;
 use stream::PairState;
 
 /// Number of events kept for the report.
@@ -171,6 +175,9 @@ impl<P: Clone> Governor<P> {
         self.tick(now);
         let times = self.sla.times(channel.name());
         let id = self.arbiter.open((now, times.t_max), kind, channel, key, payload);
+        if let Some(delay) = self.hedge_delay(kind, times) {
+            self.arbiter.schedule_hedge(id, now + delay);
+        }
         self.dispatch(now, id);
         id
     }
@@ -200,7 +207,13 @@ impl<P: Clone> Governor<P> {
             None if kind == Kind::Goal => false,
             None => (self.forward_sides().iter()).any(|side| self.is_free(index, side)),
         };
+        if by == Correlation::Arrival {
+            self.pairs[index].arrivals.add(now);
+        }
         if !is_request {
+            if self.forward_sides().local {
+                self.pairs[index].arrivals.note_given_locally(now);
+            }
             // The stamp was seen before, or, when matching by arrival, a request is outstanding already.
             return self.forward(topic, &payload);
         }
@@ -245,7 +258,7 @@ impl<P: Clone> Governor<P> {
     }
 
     /// Handles an output of one side, and returns whether to deliver it. `key` identifies the input that it answers, as
-    /// the application wrote it, if it has one; `age` is the time since that stamp, zero if unknown.
+    /// the application wrote it, if it has one.
     #[must_use]
     pub fn output(
         &mut self,
@@ -253,11 +266,19 @@ impl<P: Clone> Governor<P> {
         side: Responder,
         topic: &str,
         key: Option<CorrelationKey>,
-        age: Duration,
+        age: impl Into<OutputAge>,
     ) -> DeliveryVerdict {
+        let age = age.into();
         self.tick(now);
         if side == Responder::Cloud {
-            self.measure(now, topic, age);
+            self.measure(now, topic, age.since_stamp);
+        }
+        let arrived = self.find_arrived(now, side, topic, age);
+        if let Some((pair, inputs)) = arrived {
+            if self.pairs[pair].arrivals.is_repetition(side, inputs) {
+                self.on_repeated_answer(now, side, topic, inputs.newest);
+                return DeliveryVerdict::Drop;
+            }
         }
         let verdict = match self.find_request(now, side, topic, key) {
             Some((id, output)) => self.on_answer(now, side, id, output),
@@ -271,8 +292,11 @@ impl<P: Clone> Governor<P> {
             }
         };
         if verdict == DeliveryVerdict::Deliver {
+            if let Some((pair, inputs)) = arrived {
+                self.pairs[pair].arrivals.note_delivered(side, inputs);
+            }
             if let Some(meter) = self.meter.as_mut().filter(|meter| meter.output == topic) {
-                meter.delivered.output(now, age);
+                meter.delivered.output(now, age.since_stamp);
             }
         }
         verdict
@@ -361,10 +385,13 @@ impl<P: Clone> Governor<P> {
             self.away = true;
         }
         let pairs = &self.pairs;
-        let (overdue, forgotten) = self.arbiter.expire(now, |id, record| match record.kind {
+        let Expired { hedges, overdue, forgotten } = self.arbiter.expire(now, |id, record| match record.kind {
             Kind::Input(pair) => pairs[pair].left_out_deadline(id, record),
             _ => None,
         });
+        for id in hedges {
+            self.hedge(now, id);
+        }
         let mut stop = false;
         for id in &overdue {
             stop |= self.on_t_max(*id);

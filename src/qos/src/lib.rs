@@ -45,7 +45,7 @@ mod span;
 pub use arbiter::{DeliveryVerdict, RetentionLimits};
 pub use channel::RequestChannel;
 pub use decider::{Decider, DecisionReason, LocalState, QosEvent};
-pub use governor::{Effect, Governor};
+pub use governor::{Effect, Governor, OutputAge};
 pub use hand_over::{HandOver, HandOverLedger, MissedInputs};
 pub use measure::Meter;
 pub use outcome::RequestOutcome;

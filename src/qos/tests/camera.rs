@@ -12,6 +12,7 @@
 //! 5. Each request counts once: as desired, accepted, late, or left out. What is left out changes neither Q nor the
 //!    robot's motion.
 //! 6. Feedback of a goal comes from one side at a time, and continues after a hand-over.
+//! 7. A warm original that answers within a third of T_max steps in before the first request is late.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -19,8 +20,8 @@ use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
 use qos::{
-    CorrelationKey, DeliveryVerdict, Effect, Governor, LocalState, QosEvent, QosSla, RequestChannel, RequestCounts,
-    Responder, Responders, RetentionLimits, Stamp,
+    CorrelationKey, DeliveryVerdict, Effect, Governor, LocalState, OutputAge, QosEvent, QosSla, RequestChannel,
+    RequestCounts, Responder, Responders, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -41,6 +42,8 @@ enum Sent {
 struct Node {
     takes: u64,
     is_silent: bool,
+    /// The newest picture that it was given.
+    newest: u32,
     waiting: Option<u32>,
     working: Option<(u32, u64)>,
     goals: BTreeSet<u32>,
@@ -49,7 +52,10 @@ struct Node {
 impl Node {
     fn receive(&mut self, sent: Sent) {
         match sent {
-            Sent::Picture(number) => self.waiting = Some(number),
+            Sent::Picture(number) => {
+                self.newest = self.newest.max(number);
+                self.waiting = Some(number);
+            }
             Sent::Goal(number) => drop(self.goals.insert(number)),
         }
     }
@@ -82,11 +88,14 @@ struct World {
     has_link: bool,
     nodes: [Node; 2],
     up: VecDeque<(u64, Sent)>,
-    down: VecDeque<(u64, u32)>,
+    /// Answers, with the newest picture that the node had been given.
+    down: VecDeque<(u64, [u32; 2])>,
     /// Time at which the local original will be up, and whether it is.
     local_up: Option<u64>,
     is_local_up: bool,
     pictures: u32,
+    /// Time at which each picture was published, milliseconds.
+    published: Vec<u64>,
     /// By stamp: number of delivered answers of each side.
     delivered: BTreeMap<u32, [u32; 2]>,
     speakers: BTreeMap<u32, Responder>,
@@ -124,6 +133,7 @@ impl World {
             local_up: None,
             is_local_up: false,
             pictures: 0,
+            published: Vec::new(),
             delivered: BTreeMap::new(),
             speakers: BTreeMap::new(),
             results: BTreeMap::new(),
@@ -181,13 +191,14 @@ impl World {
             self.nodes[0].receive(sent);
         }
         if let Some(number) = self.nodes[0].step(self.t) {
-            self.down.push_back((self.t + self.delay, number));
+            self.down.push_back((self.t + self.delay, [number, self.nodes[0].newest]));
         }
-        while let Some(number) = pop_arrived(&mut self.down, self.t, self.has_link) {
-            self.answer(Responder::Cloud, number);
+        while let Some([number, newest]) = pop_arrived(&mut self.down, self.t, self.has_link) {
+            let published = self.published[newest as usize - 1];
+            self.answer(Responder::Cloud, number, Some(MS * (self.t - published) as u32));
         }
         if let Some(number) = self.nodes[1].step(self.t).filter(|_| self.is_local_up) {
-            self.answer(Responder::Local, number);
+            self.answer(Responder::Local, number, None);
         }
         if self.t % FEEDBACK == 0 {
             self.send_feedback();
@@ -200,6 +211,7 @@ impl World {
 
     fn publish_picture(&mut self) {
         self.pictures += 1;
+        self.published.push(self.t);
         let topic: Arc<str> = "/image".into();
         let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp { secs: self.pictures, nsecs: 0 }));
         self.governor.input(self.now(), &topic, key, Sent::Picture(self.pictures));
@@ -212,10 +224,11 @@ impl World {
         self.apply_effects();
     }
 
-    fn answer(&mut self, side: Responder, number: u32) {
+    fn answer(&mut self, side: Responder, number: u32, since_input: Option<Duration>) {
         self.heard.push(self.t);
         let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp { secs: number, nsecs: 0 }));
-        if self.governor.output(self.now(), side, "/found", key, Duration::ZERO) == DeliveryVerdict::Deliver {
+        let age = OutputAge { since_stamp: Duration::ZERO, since_input };
+        if self.governor.output(self.now(), side, "/found", key, age) == DeliveryVerdict::Deliver {
             self.delivered.entry(number).or_default()[side.index()] += 1;
         }
         self.apply_effects();
@@ -349,6 +362,28 @@ fn offline_a_warm_original_that_answers_in_time_stops_nobody() {
         world.restore_link(true);
         world.advance(3000);
         assert_eq!(world.stops.len(), begun, "{by}, {period}: {counts:?}");
+    }
+}
+
+#[test]
+fn a_warm_original_steps_in_before_the_first_request_is_late() {
+    for (by, takes) in [("stamp", 10), ("stamp", 64), ("stamp", 100), ("arrival", 10), ("arrival", 64)] {
+        let mut world = World::with_pairs("warm", by);
+        world.nodes[1].takes = takes;
+        world.advance(3000);
+        assert_eq!(world.counts().from_local, 0, "{by}, {takes} ms: the cloud answers in time");
+        for _ in 0..5 {
+            world.cut_link();
+            world.advance(3000);
+            world.restore_link(true);
+            world.advance(3000);
+        }
+        let counts = world.counts();
+        println!("{by}, {takes} ms: {counts:?}");
+        assert!(counts.late >= 5 && counts.from_local > 100, "{by}, {takes} ms: {counts:?}");
+        assert_eq!((counts.unanswered_in_time, counts.safe_stops), (0, 0), "{by}, {takes} ms: {counts:?}");
+        let twice = world.delivered.iter().find(|(_, by)| by[0] + by[1] > 1);
+        assert_eq!(twice, None, "{by}, {takes} ms");
     }
 }
 

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::{
-    CorrelationKey, DecisionReason, DeliveryVerdict, Effect, Failure, Governor, LocalState, Phases, QosEvent, QosSla,
-    RequestChannel, RequestId, RequestOutcome, Responder, RetentionLimits, Stamp,
+    CorrelationKey, DecisionReason, DeliveryVerdict, Effect, Failure, Governor, LocalState, OutputAge, Phases,
+    QosEvent, QosSla, RequestChannel, RequestId, RequestOutcome, Responder, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -109,7 +109,8 @@ fn json(text: &str) -> serde_json::Value {
 
 #[test]
 fn pictures_under_way_go_to_a_warm_original_as_soon_as_it_is_fed() {
-    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15}"#));
+    // Nothing is hedged, because T_desire is T_max.
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15, "t_desire": 0.3}"#));
     assert_eq!(robot.effects(), ["start"]);
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     // Five pictures per second; the network has just become slow.
@@ -224,12 +225,86 @@ fn the_link_is_lost_while_the_local_original_runs() {
     let id = robot.call("sum");
     robot.advance(10);
     robot.governor.link_down(robot.now);
-    assert!(robot.advance(290).is_empty(), "it may be answered in time");
-    assert_eq!(robot.advance(1), ["feed", "sum to Local"]);
+    assert_eq!(robot.advance(290), ["sum to Local"], "the cloud may still answer in time");
+    assert_eq!(robot.advance(1), ["feed"]);
     assert_eq!(robot.governor.on_result(robot.now, Responder::Local, id), DeliveryVerdict::Deliver);
     robot.governor.link_up(robot.now, true);
     assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Drop);
     assert_eq!(robot.q(), 2.5, "late once, whatever comes");
+}
+
+#[test]
+fn a_warm_original_is_asked_shortly_before_a_request_would_be_late() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15}"#));
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
+    robot.effects();
+    // How long the original takes is not known yet: it is asked at T_desire.
+    let id = robot.call("first");
+    assert_eq!(robot.advance(99), ["first to Cloud"]);
+    assert_eq!(robot.advance(1), ["first to Local"]);
+    robot.advance(60);
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Local, id), DeliveryVerdict::Deliver);
+    robot.advance(20);
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Drop);
+    // It took 60 ms, so twice that before T_max is early enough.
+    let id = robot.call("second");
+    assert_eq!(robot.advance(179), ["second to Cloud"]);
+    assert_eq!(robot.advance(1), ["second to Local"]);
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Deliver);
+    // A goal is carried out once.
+    robot.goal("walk");
+    assert_eq!(robot.advance(300), ["walk to Cloud"]);
+    let counts = robot.governor.report(robot.now).counts;
+    assert_eq!((counts.accepted, counts.late), (2, 0), "{counts:?}");
+}
+
+#[test]
+fn what_one_side_has_answered_the_other_does_not_answer_again_without_stamps() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15}"#));
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
+    let output = |robot: &mut Robot, side: Responder, since_input: u32| {
+        let since_input = (side == Responder::Cloud).then_some(since_input * MS);
+        let age = OutputAge { since_stamp: Duration::ZERO, since_input };
+        robot.governor.output(robot.now, side, "/out", None, age)
+    };
+    for _ in 0..40 {
+        robot.input("in time");
+        robot.advance(20);
+        assert_eq!(output(&mut robot, Responder::Cloud, 20), DeliveryVerdict::Deliver);
+        robot.advance(13);
+    }
+    robot.effects();
+    robot.input("late");
+    assert_eq!(robot.advance(100), ["late to Cloud", "late to Local"]);
+    robot.advance(60);
+    assert_eq!(output(&mut robot, Responder::Local, 0), DeliveryVerdict::Deliver);
+    robot.input("next");
+    robot.advance(20);
+    assert_eq!(output(&mut robot, Responder::Cloud, 180), DeliveryVerdict::Drop, "of the late one");
+    assert_eq!(output(&mut robot, Responder::Cloud, 20), DeliveryVerdict::Deliver, "of the next");
+    // Without the link the original takes over; when the link is back, both are asked.
+    robot.governor.link_down(robot.now);
+    for _ in 0..8 {
+        robot.input("in an outage");
+        robot.advance(400);
+        let _ = output(&mut robot, Responder::Local, 0);
+    }
+    robot.governor.link_up(robot.now, true);
+    robot.input("of both");
+    robot.advance(20);
+    assert_eq!(output(&mut robot, Responder::Cloud, 20), DeliveryVerdict::Deliver);
+    assert_eq!(output(&mut robot, Responder::Local, 0), DeliveryVerdict::Drop, "of the same");
+    // Without a further input this is no answer: the side that speaks publishes it.
+    assert_eq!(output(&mut robot, Responder::Local, 0), DeliveryVerdict::Deliver);
+}
+
+#[test]
+fn a_stateful_service_is_not_hedged() {
+    let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15, "mode": "stateful"}"#));
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
+    robot.effects();
+    robot.call("sum");
+    assert_eq!(robot.advance(300), ["sum to Cloud"]);
 }
 
 #[test]

@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use budget::Budget;
+use link::control::NodeLaunch;
 use ros::bus::{Bus, Graph};
 use ros::ros2::composition::{Component, ComponentContainer, NotLoaded};
 use ros::schema::{Registry, SchemaError};
@@ -19,7 +21,7 @@ use tokio::task::AbortHandle;
 use tracing::Instrument;
 
 use crate::links::NodeController;
-use crate::{Observer, StubNode, following};
+use crate::{Observer, following};
 
 /// Timeout for a container to provide its load service, and for each component to be created; some components load data
 /// then.
@@ -28,9 +30,9 @@ const PATIENCE: Duration = Duration::from_secs(120);
 /// Loading state of a container.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ContainerLoad {
-    /// Not everything is loaded.
+    /// Some components are not loaded yet.
     Loading,
-    /// Everything is loaded; contains the absolute names of the nodes.
+    /// All components are loaded; contains the absolute names of the nodes.
     Loaded(Vec<String>),
     /// A component could not be loaded, for this reason.
     Refused(String),
@@ -85,12 +87,14 @@ impl Drop for ComponentLoader {
 
 impl ComponentLoader {
     /// Starts following the containers of a servant; `None` if there is nothing to load. Containers in `nodes` were
-    /// started by stubs and hold what the robot loads into them.
+    /// started by stubs and hold what the robot loads into them. The processor time for following is charged to
+    /// `budget`.
     pub(crate) fn start(
         bus: &Arc<dyn Bus>,
         nodes: &Arc<dyn NodeController>,
         observer: &Arc<dyn Observer>,
         wanted: ComponentPlan,
+        budget: &Budget,
     ) -> Option<ComponentLoader> {
         if wanted.components.is_empty() {
             return None;
@@ -105,7 +109,7 @@ impl ComponentLoader {
         });
         Some(ComponentLoader {
             shown: followed.shown.subscribe(),
-            task: tokio::spawn(followed.run().in_current_span()).abort_handle(),
+            task: tokio::spawn(budget.meter(followed.run()).in_current_span()).abort_handle(),
         })
     }
 
@@ -141,7 +145,7 @@ impl ContainerFollower {
     async fn load_container(self: Arc<Self>, name: String) {
         let linked = self.nodes.running_nodes().await;
         let graph = self.bus.graph().borrow().clone();
-        let has = |linked: &StubNode| graph.is_in_process(&linked.node.name, &name);
+        let has = |linked: &NodeLaunch| graph.is_in_process(&linked.name, &name);
         if linked.iter().any(has) {
             return;
         }

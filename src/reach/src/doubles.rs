@@ -8,19 +8,17 @@ use parking_lot::Mutex;
 use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
+use crate::Observer;
 use crate::links::{MeasuredRequest, NodeController, NodeError};
-use crate::{Observer, StubNode};
 
 /// Nodes started by stubs, and nothing else.
 #[derive(Default)]
-pub struct StubNodesDouble(Vec<StubNode>);
+pub struct StubNodesDouble(Vec<NodeLaunch>);
 
 impl StubNodesDouble {
     /// Creates a double with one node of this name.
     pub fn node(name: &str) -> Self {
-        let node = NodeLaunch { name: name.to_owned(), ..NodeLaunch::default() };
-        let given = Vec::new();
-        Self(vec![StubNode { node, given }])
+        Self(vec![NodeLaunch { name: name.to_owned(), ..NodeLaunch::default() }])
     }
 }
 
@@ -38,7 +36,7 @@ impl NodeController for StubNodesDouble {
     async fn is_running(&self, _node: &str) -> bool {
         false
     }
-    async fn running_nodes(&self) -> Vec<StubNode> {
+    async fn running_nodes(&self) -> Vec<NodeLaunch> {
         self.0.clone()
     }
     fn parameters(&self, _node: &NodeLaunch) -> Vec<(String, ParamValue)> {
@@ -57,8 +55,9 @@ impl NodeController for StubNodesDouble {
 #[derive(Default)]
 pub struct RecordedEvents(pub Mutex<Vec<(String, String)>>);
 
+#[async_trait]
 impl Observer for RecordedEvents {
-    fn check_stub(&self, _made_of: Option<u64>, _image: &str) -> Result<(), FailureReason> {
+    async fn check_stub(&self, _made_of: Option<u64>, _image: &str) -> Result<(), FailureReason> {
         Ok(())
     }
     fn record_event(&self, _level: api::Level, kind: &str, message: &str, _robot: Option<&str>) {

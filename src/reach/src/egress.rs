@@ -13,9 +13,9 @@ mod relay;
 pub use relay::Relays;
 
 /// Syntax of a destination in a push.
-const ASKED: &str = "a HOST:PORT to connect to";
+const DESTINATION_SYNTAX: &str = "a HOST:PORT to connect to";
 /// Syntax of a rule in the configuration.
-const WRITTEN: &str = "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
+const RULE_SYNTAX: &str = "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
 
 /// Reason why a route is refused.
 #[derive(Debug, thiserror::Error)]
@@ -170,7 +170,7 @@ impl FromStr for EgressRule {
     type Err = EgressError;
 
     fn from_str(text: &str) -> Result<EgressRule, EgressError> {
-        let malformed = || EgressError::Malformed { name: text.to_owned(), form: WRITTEN };
+        let malformed = || EgressError::Malformed { name: text.to_owned(), form: RULE_SYNTAX };
         let (host, port) = split_host_port(text).ok_or_else(malformed)?;
         let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
         let hosts = match bare.unwrap_or(host) {
@@ -208,7 +208,7 @@ pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, Egress
     let mut hosts: Vec<&str> = Vec::new();
     let mut routes = Vec::new();
     for name in asked {
-        let malformed = || EgressError::Malformed { name: name.clone(), form: ASKED };
+        let malformed = || EgressError::Malformed { name: name.clone(), form: DESTINATION_SYNTAX };
         let (host, port) = split_host_port(name).ok_or_else(malformed)?;
         if !is_name(host) {
             return Err(malformed());

@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     /// Only limits the duration of a failing test.
-    const LONG: Duration = Duration::from_secs(60);
+    const PATIENCE: Duration = Duration::from_secs(60);
 
     fn graph(nodes: &[(&str, &str)]) -> Arc<Graph> {
         let nodes = nodes.iter();
@@ -105,7 +105,7 @@ mod tests {
         let mut next = async |count: usize| {
             let mut heard = Vec::new();
             while heard.len() < count {
-                heard.push(timeout(LONG, told.recv()).await.expect("told").expect("open"));
+                heard.push(timeout(PATIENCE, told.recv()).await.expect("told").expect("open"));
             }
             heard.sort();
             heard
@@ -119,6 +119,6 @@ mod tests {
         shown.send_replace(graph(&[]));
         assert_eq!(next(4).await, ["ended /box", "ended /late", "gone /box", "gone /late"]);
         drop(shown);
-        timeout(LONG, following).await.expect("it ends").expect("it does not panic");
+        timeout(PATIENCE, following).await.expect("it ends").expect("it does not panic");
     }
 }

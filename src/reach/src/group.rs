@@ -160,7 +160,7 @@ impl ServantGroup {
         });
         let values = values.collect();
         let interface = shareable::shared_interface(interface);
-        let whole = Arc::new(GroupView::deployed(ros, &interface));
+        let whole = Arc::new(GroupView::from_interface(ros, &interface));
         let state = State {
             dispatcher: Dispatcher::new(rules),
             doors: HashMap::new(),

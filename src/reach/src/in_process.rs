@@ -4,9 +4,9 @@ use std::any::Any;
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, WaitingConnection};
-use link::control::NodeLaunch;
-use link::session::DisconnectReason;
+use bridge::{Bridge, BridgeOptions, MetricsSnapshot, RequestObserver, SessionEnd, SessionOptions, WaitingConnection};
+use budget::Budget;
+use futures_util::future::BoxFuture;
 use package::interface::Interface;
 use ros::bus::{Bus, Graph};
 use ros::schema::Registry;
@@ -17,9 +17,9 @@ use crate::components::{ComponentLoader, Loads};
 use crate::inside::{InsideHost, InsideView, JoinFn};
 use crate::lifecycle::{LifecycleDriver, Stages};
 use crate::links::{Hub, HubOptions, LinkStatus, NodeController};
-use crate::tap::Tap;
+use crate::tap::{Tap, TapReceiver};
 use crate::trial::{self, Material, Replay, ReplayPace};
-use crate::{Error, FlowCounts, Reach, ReachOptions, StubNode, Tenant, UpgradedStream};
+use crate::{Error, FlowCounts, Observer, Reach, ReachOptions, StubSetup, Tenant, UpgradedStream};
 
 /// A bus with a bridge and a link hub.
 pub(crate) struct InProcess {
@@ -47,6 +47,7 @@ pub(crate) struct InProcessParts {
     /// Joins the bus for people who look inside.
     pub(crate) inside: JoinFn,
     pub(crate) registry: Arc<Registry>,
+    pub(crate) observer: Arc<dyn Observer>,
     pub(crate) lifecycles: Option<LifecycleDriver>,
     pub(crate) components: Option<ComponentLoader>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,
@@ -54,8 +55,7 @@ pub(crate) struct InProcessParts {
 
 impl InProcess {
     pub(crate) fn new(behind: InProcessParts, options: ReachOptions) -> InProcess {
-        let InProcessParts { id, bus, linked: (linked, nodes), inside, registry, lifecycles, components, keeps } =
-            behind;
+        let InProcessParts { id, bus, linked: (linked, nodes), inside, registry, observer, .. } = behind;
         let tap = Arc::new(Tap::default());
         let shown = tap.wrap(Arc::clone(&bus));
         // Stubs of a robot that shares its servants see them under names of their own.
@@ -70,7 +70,8 @@ impl InProcess {
             ..HubOptions::default()
         };
         let hub = Hub::new(&id, linked, Arc::clone(&registry), Arc::clone(&nodes), habits);
-        let options = BridgeOptions { budget: options.budget, ..options.bridge };
+        let called = RequestObserver::new(move |took| observer.on_rosbridge_request(took));
+        let options = BridgeOptions { budget: options.budget, called, ..options.bridge };
         InProcess {
             inside: InsideHost::new(inside, Arc::clone(&registry), &options),
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
@@ -78,9 +79,9 @@ impl InProcess {
             tap,
             hub,
             nodes,
-            lifecycles,
-            components,
-            _keeps: keeps,
+            lifecycles: behind.lifecycles,
+            components: behind.components,
+            _keeps: behind.keeps,
         }
     }
 }
@@ -107,35 +108,29 @@ impl Reach for InProcess {
         self.inside.open_view().await
     }
 
-    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8]) -> DisconnectReason {
-        self.hub.serve(stream, read_ahead).await
+    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8], end: BoxFuture<'_, String>) -> String {
+        self.hub.serve_until(stream, read_ahead, end).await.to_string()
     }
 
-    fn tap(&self) -> Option<Arc<Tap>> {
-        Some(Arc::clone(&self.tap))
+    async fn tap(&self, budget: &Budget) -> Option<TapReceiver> {
+        self.tap.listen(budget)
     }
 
-    fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
-        self.lifecycles.as_ref().map(LifecycleDriver::stages)
+    fn lifecycles(&self) -> watch::Receiver<Stages> {
+        self.lifecycles.as_ref().map_or_else(|| watch::channel(Stages::default()).1, LifecycleDriver::stages)
     }
 
-    fn loads(&self) -> Option<watch::Receiver<Loads>> {
-        self.components.as_ref().map(ComponentLoader::loads)
+    fn loads(&self) -> watch::Receiver<Loads> {
+        self.components.as_ref().map_or_else(|| watch::channel(Loads::default()).1, ComponentLoader::loads)
     }
 
-    async fn stub_nodes(&self) -> Vec<StubNode> {
-        self.nodes.running_nodes().await
+    async fn stub_setup(&self) -> Result<StubSetup, Error> {
+        Ok(self.hub.read_setup().await?)
     }
 
-    async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
-        // Without global parameters, those of the node are on its command line.
-        if let Ok(parameters) = self.bus.parameters() {
-            for (key, value) in self.nodes.parameters(node) {
-                parameters.set(&key, value).await?;
-            }
-        }
-        let started = self.nodes.start(node, "").await;
-        started.map_err(|error| Error::Linked(Box::new(error)))
+    async fn apply_stub_setup(&self, setup: &StubSetup) -> Result<(), Error> {
+        let applied = self.hub.apply_setup(setup).await;
+        applied.map_err(|error| Error::Linked(Box::new(error)))
     }
 
     fn links(&self) -> Vec<LinkStatus> {
@@ -171,8 +166,8 @@ impl Reach for InProcess {
         inputs
     }
 
-    fn metrics(&self) -> &Metrics {
-        self.bridge.metrics()
+    fn metrics(&self) -> MetricsSnapshot {
+        self.bridge.metrics().snapshot()
     }
 
     async fn replay(

@@ -16,7 +16,7 @@ use crate::UpgradedStream;
 use crate::endings::ExitNotifier;
 
 /// WebSocket close code for an internal error.
-const FAILED: u16 = 1011;
+const CLOSE_FAILED: u16 = 1011;
 /// WebSocket close code for a servant that ends.
 const ENDS: u16 = 1012;
 
@@ -55,7 +55,7 @@ struct InsideNode {
     _endings: Option<ExitNotifier>,
 }
 
-/// The ROS graph of a servant for a viewer, as long as this lives.
+/// The ROS graph of a servant for a viewer.
 pub struct InsideView {
     /// Bus of the servant.
     pub bus: Arc<dyn Bus>,
@@ -63,7 +63,8 @@ pub struct InsideView {
     pub registry: Arc<Registry>,
     /// Reason why it ended, once it has.
     pub ended: watch::Receiver<Option<String>>,
-    _looking: Arc<InsideNode>,
+    /// Guard, to be dropped when the viewer has left.
+    pub held: Box<dyn Send + Sync>,
 }
 
 impl InsideHost {
@@ -107,7 +108,7 @@ impl InsideHost {
             bus: Arc::clone(&looking.bus),
             registry: Arc::clone(&self.registry),
             ended: self.state.lock().closed.subscribe(),
-            _looking: looking,
+            held: Box::new(looking),
         })
     }
 
@@ -134,7 +135,8 @@ impl InsideHost {
             return Ok(looking);
         }
         let joined = (self.join)().await;
-        let JoinedBus { bus, endings } = joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
+        let JoinedBus { bus, endings } =
+            joined.map_err(|error| (CLOSE_FAILED, format!("cannot look inside: {error}")))?;
         let registry = Arc::clone(&self.registry);
         let bridge = Bridge::new(Arc::clone(&bus), registry, self.options.clone());
         let looking = Arc::new(InsideNode { bus, bridge, _endings: endings });

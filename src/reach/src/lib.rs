@@ -47,11 +47,9 @@ use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, WaitingConnection};
+use bridge::{BridgeOptions, MetricsSnapshot, SessionEnd, SessionOptions, WaitingConnection};
 use budget::Budget;
 use futures_util::future::BoxFuture;
-use link::control::NodeLaunch;
-use link::session::DisconnectReason;
 use package::interface::Interface;
 use package::inventory::Inventory;
 use ros::bus::{Bus, BusError, Graph, ParamValue, RosVersion};
@@ -66,19 +64,19 @@ use tokio::sync::watch;
 use translation::TranslationRules;
 
 use components::Loads;
-use egress::Relays;
 use lifecycle::Stages;
 use links::{LinkStatus, NodeError};
-use tap::Tap;
+use tap::TapReceiver;
 
 pub use ends::describe_exit;
 pub use inside::InsideView;
-pub use links::StubNode;
+pub use links::StubSetup;
 pub use local::LocalOpener;
 pub use nodes::LinkedNodes;
 pub use observer::{Observer, Tenant};
 pub use request_times::RequestTimes;
-pub use trial::{Material, Picture, RECORDED, Replay, ReplayPace, RequestGap, check_material};
+pub use sockets::ServantSockets;
+pub use trial::{MAX_RECORDED, Material, Picture, Replay, ReplayPace, RequestGap, check_material};
 
 /// Recorded data of the revision from which a servant was started.
 #[derive(Debug, Clone)]
@@ -160,29 +158,31 @@ pub trait Reach: Send + Sync + 'static {
     async fn serve_inside(&self, client: WaitingConnection<UpgradedStream>, options: SessionOptions) -> SessionEnd;
     /// Returns its ROS graph for a viewer of another protocol, or the close code (RFC 6455) and reason.
     async fn open_inside(&self) -> Result<InsideView, (u16, String)>;
-    /// Serves a stub's connection after its upgrade until it ends; `read_ahead` was already read from it.
-    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8]) -> DisconnectReason;
-    /// Returns the tap on the robot's requests, if there is one.
-    fn tap(&self) -> Option<Arc<Tap>> {
+    /// Serves a stub's connection after its upgrade until it ends; returns the reason. `read_ahead` was already read
+    /// from it. It is closed with the reason that `end` gives.
+    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8], end: BoxFuture<'_, String>) -> String;
+    /// Starts listening to the robot's requests; what is heard is charged to `budget`. Returns `None` if somebody
+    /// listens already.
+    async fn tap(&self, _budget: &Budget) -> Option<TapReceiver> {
         None
     }
     /// Returns the status of its links by node.
     fn links(&self) -> Vec<LinkStatus>;
-    /// Returns a watch on the lifecycle states of its nodes; `None` if its ROS version has none.
-    fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
-        None
+    /// Returns a watch on the lifecycle states of its nodes; empty if its ROS version has none.
+    fn lifecycles(&self) -> watch::Receiver<Stages> {
+        watch::channel(Stages::default()).1
     }
-    /// Returns a watch on the loading states of its component containers; `None` if there is nothing to load.
-    fn loads(&self) -> Option<watch::Receiver<Loads>> {
-        None
+    /// Returns a watch on the loading states of its component containers; empty if there is nothing to load.
+    fn loads(&self) -> watch::Receiver<Loads> {
+        watch::channel(Loads::default()).1
     }
-    /// Returns the running nodes that stubs have started.
-    async fn stub_nodes(&self) -> Vec<StubNode> {
-        Vec::new()
+    /// Returns what the robot's stubs have set up.
+    async fn stub_setup(&self) -> Result<StubSetup, Error> {
+        Ok(StubSetup::default())
     }
-    /// Starts a node as a stub would, with the parameters from the push of this servant's revision.
-    async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
-        Err(Error::Linked(Box::new(NodeError::OnlyByStubs(node.name.clone()))))
+    /// Sets up what the stubs of a robot have set up in another servant.
+    async fn apply_stub_setup(&self, _setup: &StubSetup) -> Result<(), Error> {
+        Ok(())
     }
     /// Returns the counts of messages and calls by user.
     fn flows(&self) -> Vec<FlowCounts> {
@@ -195,24 +195,8 @@ pub trait Reach: Send + Sync + 'static {
         Vec::new()
     }
     /// Returns the metrics of its rosbridge sessions.
-    fn metrics(&self) -> &Metrics;
-    /// Returns the number of messages dropped because a client or the bridge was slow.
-    fn dropped_count(&self) -> u64 {
-        let metrics = self.metrics();
-        metrics.dropped.get() + metrics.bus_dropped.get()
-    }
-    /// Returns the numbers of dropped messages by topic, highest first: of rosbridge clients, and of links at both
-    /// ends.
-    fn drops(&self) -> Vec<(String, u64)> {
-        let mut topics = self.metrics().drops.all();
-        for link in self.links() {
-            for drop in link.drops.iter().chain(&link.dropped) {
-                *topics.entry(drop.topic.clone()).or_default() += drop.count;
-            }
-        }
-        let mut topics: Vec<(String, u64)> = topics.into_iter().collect();
-        topics.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
-        topics
+    fn metrics(&self) -> MetricsSnapshot {
+        MetricsSnapshot::default()
     }
     /// Replays material and reports the responses and their times.
     async fn replay(
@@ -253,11 +237,12 @@ pub trait Opener: Send + Sync + 'static {
     fn process_ids(&self, servant: &str) -> Vec<i32>;
 }
 
-/// The bus of an observed servant. Egress of its nodes is relayed as long as this lives.
+/// The bus of an observed servant.
 pub struct ObservedBus {
     /// Bus of the servant.
     pub bus: Arc<dyn Bus>,
-    _relays: Relays,
+    /// Guard; egress of the nodes is relayed as long as it lives.
+    pub held: Box<dyn Send + Sync>,
 }
 
 /// Errors of reaching or trying a servant.

@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use budget::Budget;
+use link::control::NodeLaunch;
 use ros::bus::{Bus, RosVersion};
 use ros::ros2::lifecycle::{BeginOutcome, LifecycleNode, State};
 use tokio::sync::watch;
@@ -18,7 +20,7 @@ use tokio::task::AbortHandle;
 use tracing::Instrument;
 
 use crate::links::NodeController;
-use crate::{Observer, StubNode, following};
+use crate::{Observer, following};
 
 /// Timeout of one transition; nodes load data then.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -53,11 +55,12 @@ impl Drop for LifecycleDriver {
 
 impl LifecycleDriver {
     /// Starts following the nodes of a servant; `None` if its ROS version has no lifecycles. Those in `nodes` were
-    /// started by stubs and are managed by the robot.
+    /// started by stubs and are managed by the robot. The processor time for following is charged to `budget`.
     pub(crate) fn start(
         bus: &Arc<dyn Bus>,
         nodes: &Arc<dyn NodeController>,
         observer: &Arc<dyn Observer>,
+        budget: &Budget,
     ) -> Option<LifecycleDriver> {
         if bus.version() == RosVersion::One {
             return None;
@@ -67,7 +70,7 @@ impl LifecycleDriver {
             LifecycleFollower { bus: Arc::clone(bus), nodes: Arc::clone(nodes), observer: Arc::clone(observer), shown };
         Some(LifecycleDriver {
             shown: followed.shown.subscribe(),
-            task: tokio::spawn(Arc::new(followed).run().in_current_span()).abort_handle(),
+            task: tokio::spawn(budget.meter(Arc::new(followed).run()).in_current_span()).abort_handle(),
         })
     }
 
@@ -97,7 +100,7 @@ impl LifecycleFollower {
         let node = LifecycleNode::new(Arc::clone(&self.bus), &name);
         let linked = self.nodes.running_nodes().await;
         let graph = self.bus.graph().borrow().clone();
-        let has = |linked: &StubNode| graph.is_in_process(&linked.node.name, &name);
+        let has = |linked: &NodeLaunch| graph.is_in_process(&linked.name, &name);
         if !linked.iter().any(has) {
             self.update_stage(&name, |stage| stage.begins = true);
             self.activate(&node, &name).await;

@@ -14,14 +14,15 @@
 //! Robots of the other ROS see the servant's bus translated (`views`); everything else is the same for them.
 
 mod attempts;
-mod carried;
+mod carried_interface;
 mod duplicates;
-mod given;
-mod held;
+mod given_inputs;
+mod held_records;
 mod inputs;
 mod launches;
-mod lent;
+mod lent_services;
 mod mirror;
+mod node_endpoints;
 mod node_link;
 mod node_time;
 mod nodes;
@@ -29,7 +30,7 @@ mod outputs;
 mod parameters;
 mod requests;
 mod runs;
-mod seen;
+mod setup;
 mod state;
 mod status;
 mod turns;
@@ -64,8 +65,9 @@ use link::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 
 use crate::FlowCounts;
 use attempts::Attempts;
-pub use nodes::{NodeController, NodeError, StubNode};
+pub use nodes::{NodeController, NodeError};
 pub use requests::{MeasuredRequest, RequestUpdate};
+pub use setup::StubSetup;
 pub use state::{Hub, HubOptions};
 use state::{NodeLink, RobotMachine, ServantView};
 pub use status::LinkStatus;
@@ -157,27 +159,46 @@ impl Hub {
         }
     }
 
-    /// Serves one connection after its WebSocket upgrade until it ends.
-    pub async fn serve<S>(self: &Arc<Self>, io: S, read_ahead: &[u8]) -> DisconnectReason
+    /// Serves one connection after its WebSocket upgrade until it ends, or is to `end`: then its robot is told the
+    /// reason.
+    pub async fn serve_until<S>(
+        self: &Arc<Self>,
+        io: S,
+        read_ahead: &[u8],
+        end: impl Future<Output = String> + Send,
+    ) -> DisconnectReason
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
         let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD)
             .with_budget(&self.options.budget, self.options.unfinished);
+        let reason = tokio::select! {
+            lost = self.serve(&mut socket) => return lost,
+            reason = end => reason,
+        };
+        close(&mut socket, 1008, &reason).await;
+        DisconnectReason::Closed { code: 1008, reason }
+    }
+
+    async fn serve<S>(self: &Arc<Self>, socket: &mut WebSocket<S>) -> DisconnectReason
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send,
+    {
         let mut held = self.options.budget.child(GREETING, MAX_TOLD).permit();
-        let opening = receive_open(&mut socket, "hello", &mut held);
+        let opening = receive_open(socket, "hello", &mut held);
         let mut hello: Hello = match timeout(HELLO, opening).await {
             Ok(Ok(hello)) => hello,
-            Ok(Err(lost)) => return send_refusal(&mut socket, lost).await,
+            Ok(Err(lost)) => return send_refusal(socket, lost).await,
             Err(_) => return DisconnectReason::Silent(HELLO),
         };
-        if hello.own_bytes() > MAX_CONTROL {
+        let own = hello.own_bytes();
+        if own > MAX_CONTROL {
             let error = link::Error::TooMuch {
                 what: "a hello without parameters",
-                bytes: hello.own_bytes() as u64,
+                bytes: own as u64,
                 limit: MAX_CONTROL as u64,
             };
-            return send_refusal(&mut socket, DisconnectReason::Protocol(error)).await;
+            return send_refusal(socket, DisconnectReason::Protocol(error)).await;
         }
         let ignored = launches::adapt_node(&mut hello, self.bus.version());
         let (link, resumed, turn) = match self.attach(&hello, &ignored).await {
@@ -185,9 +206,8 @@ impl Hub {
             Err(refusal) => {
                 tracing::info!("a link was refused: {}", refusal.reason);
                 let welcome = Welcome::Refused { reason: refusal.reason.clone(), again: refusal.again };
-                let _ = send_open(&mut socket, &welcome).await;
-                socket.queue_close(1008, "refused");
-                let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
+                let _ = send_open(socket, &welcome).await;
+                close(socket, 1008, "refused").await;
                 return DisconnectReason::Closed { code: 1008, reason: refusal.reason };
             }
         };
@@ -220,17 +240,16 @@ impl Hub {
             .as_ref()
             .filter(|_| resumed)
             .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
-        link.session.set_quality(hello.quality);
-        link.session.set_peer_codecs(&hello.codecs);
+        link.session.set_peer_codecs(&hello.codecs, hello.quality);
         link.session.set_peer_limits(hello.limits);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
         link.requests.on_connected(Instant::now());
-        if let Err(lost) = send_open(&mut socket, &welcome).await {
+        if let Err(lost) = send_open(socket, &welcome).await {
             return lost;
         }
         tracing::info!(resumed, "a robot's node is linked");
         let lost = {
-            let mut running = pin!(link.session.run(&mut socket, &*link));
+            let mut running = pin!(link.session.run(socket, &*link));
             let replaced = async { kicked.wait_for(|kicks| *kicks != turn).await.is_ok() };
             let lost = tokio::select! {
                 lost = &mut running => Some(lost),
@@ -310,14 +329,14 @@ impl Hub {
         let view = self.view_for(robot);
         self.check_carried(&view)?;
         view.parameters.watch(self).await;
-        lent::start_lending(self).await;
+        lent_services::start_lending(self).await;
         let running = self.nodes.is_running(node).await;
         let ours = running && self.is_of_run(node, &hello.run).await;
         if running && !ours {
             self.stop_node(node).await;
         }
         view.parameters.copy_from_hello(self, hello).await;
-        if robot == RosVersion::Two && view.translated().is_some() {
+        if robot == RosVersion::Two && view.translated_bus().is_some() {
             let copied = self.copy_simulated_time(hello).await;
             copied.map_err(|error| LinkRefusal { reason: error.to_string(), again: true })?;
         }
@@ -376,10 +395,10 @@ impl Hub {
 
     /// Checks that a robot of the other ROS can use anything of the service.
     fn check_carried(&self, view: &ServantView) -> Result<(), LinkRefusal> {
-        let Some((bus, interface)) = view.translated().zip(self.nodes.interface()) else {
+        let Some((bus, interface)) = view.translated_bus().zip(self.nodes.interface()) else {
             return Ok(());
         };
-        let Some(reason) = carried::find_refusal(bus, interface) else {
+        let Some(reason) = carried_interface::find_refusal(bus, interface) else {
             return Ok(());
         };
         let (ours, robot) = (self.bus.version().number(), bus.version().number());
@@ -503,10 +522,18 @@ where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     if let Some((code, reason)) = lost.close_frame() {
-        socket.queue_close(code, &reason);
-        let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
+        close(socket, code, &reason).await;
     }
     lost
+}
+
+/// Tells the robot why its connection ends.
+async fn close<S>(socket: &mut WebSocket<S>, code: u16, reason: &str)
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    socket.queue_close(code, reason);
+    let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
 }
 
 fn replaced_disconnect() -> DisconnectReason {

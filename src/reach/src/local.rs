@@ -71,7 +71,7 @@ impl Opener for LocalOpener {
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));
-        let looking = JoinOptions { node: bridge::INSIDE.to_owned(), ..joining.clone() };
+        let looking = JoinOptions { node: bridge::INSIDE_NODE.to_owned(), ..joining.clone() };
         let (ros, beside) = (options.ros, Arc::clone(&sockets));
         // Whoever looks inside first, this bus is not of that connection.
         let (looked_at, span) = (Arc::clone(servant), Span::current());
@@ -89,8 +89,8 @@ impl Opener for LocalOpener {
         let endings = ExitNotifier::start(servant.events(), Arc::clone(&bus));
         let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
         let nodes: Arc<dyn NodeController> = Arc::new(nodes);
-        let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer);
-        let components = ComponentLoader::start(&bus, &nodes, &observer, wanted);
+        let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer, &options.budget);
+        let components = ComponentLoader::start(&bus, &nodes, &observer, wanted, &options.budget);
         let behind = InProcessParts {
             id: servant.id().to_owned(),
             linked: (Arc::clone(&bus), nodes),
@@ -106,6 +106,7 @@ impl Opener for LocalOpener {
                 joined.instrument(span.clone()).boxed()
             }),
             registry,
+            observer,
             lifecycles,
             components,
             keeps: Box::new((relays, endings)),
@@ -124,7 +125,7 @@ impl Opener for LocalOpener {
         let relays = self.open_relays(&local, egress).await;
         let sockets = Arc::new(ServantSockets::new(local.network()));
         let joining = JoinOptions::new(master::ADDRESS, name);
-        Ok(ObservedBus { bus: ros::connect(ros, sockets, joining).await?, _relays: relays })
+        Ok(ObservedBus { bus: ros::connect(ros, sockets, joining).await?, held: Box::new(relays) })
     }
 
     fn process_ids(&self, servant: &str) -> Vec<i32> {

@@ -22,7 +22,7 @@ pub struct MasterConfig {
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
-/// Before this field existed, every servant had a Master.
+/// Default of the field: before it existed, every servant had a Master.
 fn yes() -> bool {
     true
 }

@@ -2,7 +2,7 @@
 //! the robot.
 
 mod planned;
-mod told;
+mod stub_events;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,11 +21,11 @@ use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
 use crate::links::{MeasuredRequest, NodeController, NodeError};
-use crate::{Observer, RecordedRevision, StubNode, Tenant, describe_exit};
+use crate::{Observer, RecordedRevision, Tenant, describe_exit};
 
 use planned::OwnNodes;
 
-pub(crate) use told::RobotEvents;
+pub(crate) use stub_events::RobotEvents;
 
 /// Number of lines queued for a slow link; the others are lost but are in the servant's log.
 const LINES: usize = 256;
@@ -75,7 +75,7 @@ impl LinkedNodes {
     /// Ends the revision's own nodes, which a stub's nodes replace.
     async fn end_own_nodes(&self, tenant: &dyn Tenant) {
         let ending = || planned::end_all(&*self.container, &self.recorded.nodes);
-        self.planned.end_once(|| tenant.take_over(), ending).await;
+        self.planned.end_once(tenant.take_over(), ending).await;
     }
 }
 
@@ -144,7 +144,7 @@ impl NodeController for LinkedNodes {
 
     async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError> {
         let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
-        self.told.observer().check_stub(node.revision, &node.image)?;
+        self.told.observer().check_stub(node.revision, &node.image).await?;
         let program = find_program(&self.recorded, node)?;
         self.end_own_nodes(&*tenant).await;
         let says = naming_for(&self.recorded, node);
@@ -179,13 +179,12 @@ impl NodeController for LinkedNodes {
         self.container.run_id(node)
     }
 
-    async fn running_nodes(&self) -> Vec<StubNode> {
+    async fn running_nodes(&self) -> Vec<NodeLaunch> {
         let started: Vec<NodeLaunch> = self.started.lock().values().cloned().collect();
         let mut running = Vec::new();
         for node in started {
             if self.is_running(&node.name).await {
-                let given = self.parameters(&node);
-                running.push(StubNode { node, given });
+                running.push(node);
             }
         }
         running
@@ -197,10 +196,10 @@ impl NodeController for LinkedNodes {
     }
 
     async fn wait_exit(&self, node: &str) -> Exit {
-        let limits = self.told.tenant().map(|tenant| tenant.limits()).unwrap_or_default();
         match self.container.wait_node(node).await {
             Ok(exit) => {
-                Exit { code: exit.code, signal: exit.signal, text: format!("{node} {}", describe_exit(&exit, &limits)) }
+                let how = describe_exit(&exit, &self.container.enforced_limits().limits);
+                Exit { code: exit.code, signal: exit.signal, text: format!("{node} {how}") }
             }
             Err(error) => Exit { text: error.to_string(), ..Exit::default() },
         }

@@ -21,7 +21,7 @@ pub struct RequestTimes {
 #[derive(Default)]
 struct ServiceTimes {
     total: Histogram,
-    /// In the order of [`PHASES`].
+    /// Histograms in the order of [`PHASES`].
     phases: [Histogram; 5],
 }
 

@@ -15,7 +15,7 @@ use tokio::sync::Mutex;
 /// has announced them.
 const EARLIER: usize = 8;
 /// Lease duration of `rtps` participants: others may believe in them this long after a daemon has ended.
-const BELIEVED: Duration = Duration::from_secs(10);
+const LEASE: Duration = Duration::from_secs(10);
 
 /// The participants of the daemon in one servant.
 #[derive(Debug)]
@@ -74,7 +74,7 @@ impl ParticipantLedger {
 
     /// Returns the participants whose departure must be announced now.
     fn gone_participants(&self, now: Instant) -> Vec<ParticipantPrefix> {
-        let is_believed = now.duration_since(self.since) < BELIEVED;
+        let is_believed = now.duration_since(self.since) < LEASE;
         if is_believed { self.left.earlier.clone() } else { Vec::new() }
     }
 }
@@ -143,7 +143,7 @@ mod tests {
             ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now).record_join("/bridge", [1; 12]);
         let mut next = ParticipantLedger::from_persisted(2, left, now);
         assert_eq!(next.gone_participants(now).len(), 1);
-        assert!(next.gone_participants(now + BELIEVED).is_empty());
+        assert!(next.gone_participants(now + LEASE).is_empty());
         // They remain recorded until later ones replace them.
         assert_eq!(next.record_join("/bridge", [2; 12]).earlier, [[1; 12]]);
     }

@@ -257,15 +257,6 @@ impl Bus for TappedBus {
         self.bus.advertise(topic, of, qos).await
     }
 
-    async fn call(&self, service: &str, request: Bytes, timeout: Duration) -> Result<Bytes, BusError> {
-        let noted = self.begin_call(service, &request);
-        let response = self.bus.call(service, request, timeout).await;
-        if let Some(noted) = noted {
-            noted.answer(TapAnswer::from_call(&response));
-        }
-        response
-    }
-
     async fn call_typed(
         &self,
         service: &str,

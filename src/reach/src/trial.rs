@@ -28,7 +28,7 @@ use plan::{PlannedInput, ReplayPlan};
 /// Minimum timeout for the servant's nodes to subscribe, and for the first response.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Maximum number of messages used from a recording.
-pub const RECORDED: usize = 300;
+pub const MAX_RECORDED: usize = 300;
 const QUEUE: usize = 16;
 
 /// Input of a replay.

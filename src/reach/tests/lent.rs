@@ -8,7 +8,7 @@ use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::clock::now;
 use link::control::{Exit, FromCloud, FromRobot, Hello, NodeLaunch, ServiceChannel, Welcome};
-use link::record::Record;
+use link::record::{Call, Record};
 use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
@@ -24,7 +24,7 @@ use tokio::time::{sleep, timeout};
 use ws::WebSocket;
 
 /// Only limits the duration of a failing test.
-const LONG: Duration = Duration::from_secs(120);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Nodes that are always running.
 struct RunningNodes;
@@ -86,7 +86,7 @@ struct LinkEventForwarder(mpsc::UnboundedSender<LinkEvent>);
 impl SessionHandler<FromCloud> for LinkEventForwarder {
     fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
-            Record::Call { id, service, request } => LinkEvent::Call(id, service, request),
+            Record::Call(Call { id, service, request }) => LinkEvent::Call(id, service, request),
             Record::Control(FromCloud::Lookup { service }) => LinkEvent::Lookup(service),
             _ => return,
         };
@@ -130,7 +130,7 @@ impl ManualRobot {
     async fn connect(&mut self, servant: &Servant) {
         let (theirs, ours) = tokio::io::duplex(1 << 16);
         let hub = Arc::clone(&servant.hub);
-        tokio::spawn(async move { hub.serve(theirs, &[]).await });
+        tokio::spawn(async move { hub.serve_until(theirs, &[], std::future::pending()).await });
         let mut socket: WebSocket<DuplexStream> = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
         let (have, ahead, next) = self.session.position();
         self.hello.next = next;
@@ -160,7 +160,7 @@ impl ManualRobot {
     }
 
     async fn next_event(&mut self) -> LinkEvent {
-        let told = timeout(LONG, self.told.recv()).await;
+        let told = timeout(PATIENCE, self.told.recv()).await;
         told.expect("something should be told").unwrap()
     }
 
@@ -199,7 +199,7 @@ fn lookup() -> LinkEvent {
 /// Starts a call of `/map` by the node.
 fn call_map(servant: &Servant, request: &'static str) -> JoinHandle<Result<Bytes, BusError>> {
     let node = Arc::clone(&servant.node);
-    tokio::spawn(async move { node.call("/map", request.into(), LONG).await })
+    tokio::spawn(async move { node.call("/map", request.into(), PATIENCE).await })
 }
 
 /// Calls `/map` until something provides it, with the robot answering, and returns the response. A node that waits for
@@ -214,7 +214,7 @@ async fn call_until_served(servant: &Servant, request: &'static str, part: impl 
         }
     };
     let both = async { tokio::join!(called, part) };
-    timeout(LONG, both).await.expect("it should be served").0
+    timeout(PATIENCE, both).await.expect("it should be served").0
 }
 
 #[tokio::test]
@@ -252,7 +252,7 @@ async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
             () = confirmed => unreachable!("it has no end"),
         }
     };
-    assert_eq!(timeout(LONG, confirmed).await.unwrap(), lookup());
+    assert_eq!(timeout(PATIENCE, confirmed).await.unwrap(), lookup());
     // The same service from another server of the robot: calls go there.
     robot.send_lent(Some(9));
     let call = call_map(&servant, "again");
@@ -298,7 +298,7 @@ async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
     assert!(second < first / 2, "{first:?}, then {second:?}");
     let mut graph = servant.bus.graph();
     let known = graph.wait_for(|graph| graph.sought.contains_key("/map"));
-    timeout(LONG, known).await.unwrap().unwrap();
+    timeout(PATIENCE, known).await.unwrap().unwrap();
     assert_eq!(servant.hub.status()[0].unserved, ["/map"]);
     // The lookup was not lost.
     robot.connect(&servant).await;
@@ -345,7 +345,7 @@ async fn a_call_outlives_a_cut_and_ends_with_the_link() {
     let call = call_map(&servant, "three");
     robot.expect_call(1, "three").await;
     robot.session.close(1000, "the robot's node ended");
-    let error = timeout(LONG, call).await.unwrap().unwrap().unwrap_err();
+    let error = timeout(PATIENCE, call).await.unwrap().unwrap().unwrap_err();
     assert!(error.to_string().contains("the link to the robot was lost"), "{error}");
 }
 

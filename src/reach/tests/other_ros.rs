@@ -1,7 +1,7 @@
 //! Links of robots whose ROS is not the servant's: a simulated robot's end, and a servant of ROS 1 at a real Master or
 //! of ROS 2 in memory.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,14 +12,16 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
 use ros::bus::{
-    Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType, wait_for_connected,
+    Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, ParamValue, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, WireType, wait_for_connected,
 };
 use ros::codec::put::CdrWriter;
-use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
+use ros::codec::{FillOptions, JsonOptions, Time, from_json, to_json};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
+use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
 use ros::ros1::master::{Master, MasterOptions};
-use ros::schema::{MessageType, Registry};
+use ros::schema::{ActionDef, MessageType, Registry};
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -35,7 +37,7 @@ mod robot;
 use memory_bus::MemorySystem;
 use robot::{CloudRequest, LinkedRobot, expect_refusal, find_output, find_service};
 
-/// What the robot's end expects of its surroundings.
+/// Surroundings that the robot's end expects.
 mod lab {
     /// Only limits the duration of a failing test.
     pub const LONG: std::time::Duration = std::time::Duration::from_secs(120);
@@ -92,9 +94,11 @@ impl NodeController for ServantNodes {
 /// Returns the definitions of an image.
 fn definitions(version: RosVersion) -> Registry {
     let registry = Registry::for_version(version);
-    for (key, text) in
-        [("std_msgs/msg/String", "string data"), ("std_srvs/srv/Trigger", "---\nbool success\nstring message")]
-    {
+    for (key, text) in [
+        ("std_msgs/msg/String", "string data"),
+        ("std_srvs/srv/Trigger", "---\nbool success\nstring message"),
+        ("x_msgs/action/Count", "int32 order\n---\nint32 sum\n---\nint32 part\n"),
+    ] {
         registry.insert(key, text).expect("a definition");
     }
     registry
@@ -179,7 +183,11 @@ impl ServiceHandler for Telling {
 }
 
 fn input(version: RosVersion, channel: u32, topic: &str, latching: bool) -> InputChannel {
-    let of = WireType::from_message(&string(version));
+    input_of(&string(version), channel, topic, latching)
+}
+
+fn input_of(of: &MessageType, channel: u32, topic: &str, latching: bool) -> InputChannel {
+    let of = WireType::from_message(of);
     InputChannel {
         channel,
         topic: topic.to_owned(),
@@ -293,6 +301,147 @@ async fn a_node_of_ros_1_calls_a_robot_of_ros_2() {
     assert_eq!(parse(&one.response, &response)["message"], "42");
 }
 
+fn count(version: RosVersion) -> Arc<ActionDef> {
+    definitions(version).action("x_msgs/Count").expect("an action")
+}
+
+/// Reports feedback, then the result, of a goal sent in this ROS.
+struct GoalSender(RosVersion, mpsc::UnboundedSender<Result<i64, GoalOutcome>>);
+
+impl GoalEvents for GoalSender {
+    fn on_feedback(&self, feedback: Bytes) {
+        let told = parse(&count(self.0).feedback, &feedback);
+        let _ = self.1.send(Ok(told["part"].as_i64().expect("a number")));
+    }
+
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
+        let _ = self.1.send(match end {
+            Ok(GoalEnd { outcome: GoalOutcome::Succeeded, result, .. }) => {
+                Ok(parse(&count(self.0).result, &result)["sum"].as_i64().expect("a number"))
+            }
+            Ok(end) => Err(end.outcome),
+            Err(_) => Err(GoalOutcome::Unknown),
+        });
+    }
+}
+
+/// Returns the events of a goal, and what they will tell.
+fn goal_events(version: RosVersion) -> (Arc<GoalSender>, mpsc::UnboundedReceiver<Result<i64, GoalOutcome>>) {
+    let (told, tells) = mpsc::unbounded_channel();
+    (Arc::new(GoalSender(version, told)), tells)
+}
+
+async fn next_told(told: &mut mpsc::UnboundedReceiver<Result<i64, GoalOutcome>>) -> Result<i64, GoalOutcome> {
+    timeout(LONG, told.recv()).await.expect("it is told").expect("the goal is there")
+}
+
+const UUID: &str = "07070707-0707-0707-0707-070707070707";
+
+#[tokio::test]
+async fn a_node_of_ros_2_sends_goals_to_a_robot_of_ros_1() {
+    let servant = Servant::new(RosVersion::Two, None).await;
+    let client = servant.node.action_client("/count", &count(RosVersion::Two)).expect("a client");
+    let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let graph = robot.wait_graph(|graph| {
+        let has = |topic| find_output(graph, topic).is_some();
+        let feeds = graph.inputs.iter().filter(|input| input.topic.starts_with("/count/") && input.feed).count();
+        has("/count/goal") && has("/count/cancel") && feeds == 3
+    });
+    let graph = graph.await;
+    let of = count(RosVersion::One);
+    let goals = find_output(&graph, "/count/goal").expect("an output");
+    assert_eq!((&*goals.type_name, &*goals.md5), ("x_msgs/CountActionGoal", of.action_goal.md5()));
+    assert!(robot.definition(&goals.type_name, &goals.md5).is_some());
+    // A server of the robot appears.
+    let cancels = find_output(&graph, "/count/cancel").expect("an output");
+    robot.listen(goals);
+    robot.listen(cancels);
+    robot.open_input(input_of(&of.action_feedback, 1, "/count/feedback", false));
+    robot.open_input(input_of(&of.action_result, 2, "/count/result", false));
+    client.wait_for_server(LONG).await.expect("a server");
+    let order = serialize(&count(RosVersion::Two).goal, &json!({ "order": 7 }));
+    let (events, mut told) = goal_events(RosVersion::Two);
+    client.send_goal(UUID, order.clone(), events);
+    let (channel, goal) = robot.next_message().await;
+    let (id, goal) = messages::read_goal(&goal).expect("a goal");
+    assert_eq!((channel, &*id.id), (goals.channel, UUID));
+    assert_eq!(parse(&of.goal, &goal), json!({ "order": 7 }));
+    let state = |status| {
+        let goal = GoalId { id: UUID.to_owned(), ..GoalId::default() };
+        GoalState { goal, status, text: String::new() }
+    };
+    let part = serialize(&of.feedback, &json!({ "part": 3 }));
+    robot.publish(1, messages::write_state(Time::default(), &state(ActionlibStatus::Active), &part));
+    assert_eq!(next_told(&mut told).await, Ok(3));
+    client.cancel_goal(UUID);
+    let (channel, cancel) = robot.next_message().await;
+    let cancel = messages::read_cancel(&cancel).expect("a cancel");
+    assert_eq!((channel, &*cancel.id), (cancels.channel, UUID));
+    let sum = serialize(&of.result, &json!({ "sum": 9 }));
+    robot.publish(2, messages::write_state(Time::default(), &state(ActionlibStatus::Preempted), &sum));
+    assert_eq!(next_told(&mut told).await, Err(GoalOutcome::Canceled));
+    // Its goals end with the server.
+    let (events, mut told) = goal_events(RosVersion::Two);
+    client.send_goal("another", order, events);
+    robot.next_message().await;
+    robot.session.send_control(&FromRobot::Close { channel: 2 });
+    assert_eq!(next_told(&mut told).await, Err(GoalOutcome::Unknown));
+}
+
+#[tokio::test]
+async fn a_node_of_ros_1_sends_goals_to_a_robot_of_ros_2() {
+    let servant = Servant::new(RosVersion::One, None).await;
+    let client = servant.node.action_client("/count", &count(RosVersion::One)).expect("a client");
+    let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let feedback = "/count/_action/feedback";
+    robot.wait_graph(|graph| graph.inputs.iter().any(|input| input.topic == feedback && input.feed)).await;
+    let of = count(RosVersion::Two);
+    robot.open_input(input_of(&of.action_feedback, 1, feedback, false));
+    // Each part is looked up, and lent.
+    let services = of.services.as_ref().expect("of ROS 2");
+    let cancel = Registry::for_version(RosVersion::Two).service("action_msgs/srv/CancelGoal").expect("known to all");
+    let parts = [("send_goal", &services.send_goal), ("get_result", &services.get_result), ("cancel_goal", &cancel)];
+    let mut lent = BTreeSet::new();
+    while lent.len() < parts.len() {
+        let asked = robot.next_request().await;
+        let CloudRequest::Lookup(service) = asked else { panic!("{asked:?}") };
+        let (channel, (_, of)) = (1..).zip(parts).find(|(_, (part, _))| service.ends_with(part)).expect("a part");
+        robot.send_lent(&service, Some((channel, &ServiceType::from_service(of))));
+        lent.insert(service);
+    }
+    client.wait_for_server(LONG).await.expect("a server");
+    let (events, mut told) = goal_events(RosVersion::One);
+    client.send_goal(UUID, serialize(&count(RosVersion::One).goal, &json!({ "order": 7 })), events);
+    let (call, request) = next_call(&mut robot, 1).await;
+    // Behind the head of its format a message begins with the goal's id.
+    assert_eq!(request[4..20], [7; 16]);
+    assert_eq!(parse(&services.send_goal.request, &request)["goal"], json!({ "order": 7 }));
+    let accepted = serialize(&services.send_goal.response, &json!({ "accepted": true }));
+    robot.session.answer(call, link::clock::now(), Ok(accepted));
+    let (call, request) = next_call(&mut robot, 2).await;
+    assert_eq!(request[4..20], [7; 16]);
+    let uuid = json!({ "uuid": vec![7; 16] });
+    robot.publish(1, serialize(&of.action_feedback, &json!({ "goal_id": uuid, "feedback": { "part": 3 } })));
+    assert_eq!(next_told(&mut told).await, Ok(3));
+    // Succeeded.
+    let result = serialize(&services.get_result.response, &json!({ "status": 4, "result": { "sum": 9 } }));
+    robot.session.answer(call, link::clock::now(), Ok(result));
+    assert_eq!(next_told(&mut told).await, Ok(9));
+}
+
+/// Returns the next call of a service, and its request; lookups in between are repeated ones.
+async fn next_call(robot: &mut LinkedRobot, channel: u32) -> (u32, Bytes) {
+    loop {
+        match robot.next_request().await {
+            CloudRequest::Lookup(_) => {}
+            CloudRequest::Call(id, called, request) => {
+                assert_eq!(called, channel);
+                return (id, request);
+            }
+        }
+    }
+}
+
 #[tokio::test]
 async fn a_node_is_started_in_the_terms_of_its_ros() {
     let servant = Servant::new(RosVersion::One, None).await;
@@ -320,7 +469,7 @@ async fn parameters_of_a_robot_of_ros_1_are_those_of_the_node_of_ros_2() {
     let value = |value: Value| serde_json::from_value::<ParamValue>(value).expect("a value");
     let see = value(json!({ "gain": 1, "gains": { "p": 0.5 }, "boxes": [[1]] }));
     hello.parameters = [("see".to_owned(), see), ("map_frame".to_owned(), value(json!("map")))].into();
-    let robot = LinkedRobot::connect(&servant.hub, &hello).await;
+    let mut robot = LinkedRobot::connect(&servant.hub, &hello).await;
     // With the type that the push has recorded, and overridden by the command line.
     let expected = "--ros-args -p gain:=1.0 -p gains.p:=0.5 -- --ros-args -p rate:=2 --";
     assert_eq!(servant.nodes.started.lock()[NODE].argv.join(" "), expected);
@@ -339,6 +488,38 @@ async fn parameters_of_a_robot_of_ros_1_are_those_of_the_node_of_ros_2() {
     while parameters.get(NODE, &names).await.expect("a node") != [Some(value(json!(3.0)))] {
         timeout(LONG, events.next()).await.expect("it is set");
     }
+    // So it is by a client of dynamic_reconfigure, which is told before.
+    let graph = robot.wait_graph(|graph| {
+        find_output(graph, "/see/parameter_updates").is_some() && find_service(graph, "/see/set_parameters").is_some()
+    });
+    let graph = graph.await;
+    let (updates, set) = (find_output(&graph, "/see/parameter_updates"), find_service(&graph, "/see/set_parameters"));
+    let (updates, set) = (updates.expect("an output"), set.expect("a service"));
+    assert_eq!(
+        (&*updates.type_name, &*set.type_name),
+        ("dynamic_reconfigure/Config", "dynamic_reconfigure/Reconfigure")
+    );
+    assert!(robot.definition(&updates.type_name, &updates.md5).expect("told").starts_with("BoolParameter[] bools"));
+    robot.listen(updates);
+    let (channel, told) = robot.next_message().await;
+    assert!(channel == updates.channel && has_gain(&told, 3.0), "{told:?}");
+    let response = robot.call(set, gain_config(4.0)).await.expect("a response");
+    assert!(has_gain(&response, 4.0), "{response:?}");
+    assert!(has_gain(&robot.next_message().await.1, 4.0));
+    robot.wait_change("/see/gain", Some(&value(json!(4.0)))).await;
+}
+
+/// Serializes a dynamic_reconfigure/Config with one double.
+fn gain_config(gain: f64) -> Bytes {
+    // Bools, integers, texts; one double; groups.
+    let counts = |counts: &[u32]| counts.iter().flat_map(|count| count.to_le_bytes()).collect::<Vec<u8>>();
+    [counts(&[0, 0, 0, 1]), counts(&[4]), b"gain".to_vec(), gain.to_le_bytes().to_vec(), counts(&[0])].concat().into()
+}
+
+/// Returns whether a message contains this gain.
+fn has_gain(message: &[u8], gain: f64) -> bool {
+    let wanted = [&b"gain"[..], &gain.to_le_bytes()].concat();
+    message.windows(wanted.len()).any(|part| part == wanted)
 }
 
 #[tokio::test]
@@ -349,7 +530,14 @@ async fn a_robot_of_ros_2_has_the_parameter_services_of_a_node_of_ros_1() {
     let parameters = servant.bus.parameters().expect("a Master");
     parameters.set("/see/rate", ParamValue::Int(5)).await.expect("a Master");
     let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
-    let graph = robot.wait_graph(|graph| find_service(graph, "/see/set_parameters").is_some()).await;
+    let graph = robot.wait_graph(|graph| {
+        find_service(graph, "/see/set_parameters").is_some() && find_output(graph, "/parameter_events").is_some()
+    });
+    let graph = graph.await;
+    let events = find_output(&graph, "/parameter_events").expect("an output");
+    let of = ros::ros2::interfaces::message("rcl_interfaces/msg/ParameterEvent").expect("a type");
+    assert_eq!((&*events.type_name, &*events.md5), (of.name(), of.digest()));
+    robot.listen(events);
     let served = find_service(&graph, "/see/set_parameters").expect("a service");
     assert_eq!(served.type_name, "rcl_interfaces/srv/SetParameters");
     // One parameter, the integer 6.
@@ -365,6 +553,12 @@ async fn a_robot_of_ros_2_has_the_parameter_services_of_a_node_of_ros_1() {
     let response = robot.call(served, request.finish()).await.expect("a response");
     assert_eq!(response[4..9], [1, 0, 0, 0, 1], "one, and successful");
     assert_eq!(parameters.get("/see/rate").await.expect("a parameter"), ParamValue::Int(6));
+    // The call has waited until the robot hears what it changes.
+    let (channel, event) = robot.next_message().await;
+    assert_eq!(channel, events.channel);
+    let event = parse(&of, &event);
+    assert_eq!((&event["node"], &event["changed_parameters"][0]["name"]), (&json!("/see"), &json!("rate")));
+    assert_eq!(event["changed_parameters"][0]["value"]["integer_value"], 6);
 }
 
 #[tokio::test]

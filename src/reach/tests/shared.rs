@@ -30,7 +30,7 @@ use tokio::time::timeout;
 use ws::WebSocket;
 
 /// Only limits the duration of a failing test.
-const LONG: Duration = Duration::from_secs(120);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Answers with the request and its servant's name; "long" is never answered.
 struct WorkService {
@@ -77,8 +77,9 @@ fn work() -> ServiceType {
 
 struct NullObserver;
 
+#[async_trait]
 impl Observer for NullObserver {
-    fn check_stub(&self, _: Option<u64>, _: &str) -> Result<(), FailureReason> {
+    async fn check_stub(&self, _: Option<u64>, _: &str) -> Result<(), FailureReason> {
         Ok(())
     }
     fn record_event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
@@ -86,14 +87,12 @@ impl Observer for NullObserver {
     fn on_request_measured(&self, _: Option<&str>, _: &MeasuredRequest<'_>) {}
 }
 
+#[async_trait]
 impl Tenant for NullObserver {
     fn robot(&self) -> &str {
         "rover"
     }
-    fn limits(&self) -> api::Limits {
-        api::Limits::default()
-    }
-    fn take_over(&self) -> bool {
+    async fn take_over(&self) -> bool {
         false
     }
 }
@@ -167,7 +166,7 @@ fn place(group: &Arc<ServantGroup>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
         bridge: BridgeOptions::default(),
         grace: Duration::from_secs(30),
         budget: Budget::without_limit(),
-        unfinished: LONG,
+        unfinished: PATIENCE,
         rules: Arc::default(),
     };
     let reach = open_seat(group, "place", test_revision(), options, Arc::new(NullObserver));
@@ -201,7 +200,7 @@ fn hello(node: &str, argv: &[&str]) -> Hello {
 async fn send_hello(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
     let (theirs, ours) = tokio::io::duplex(1 << 16);
     let reach = Arc::clone(reach);
-    tokio::spawn(async move { reach.serve_link(Box::new(theirs), &[]).await });
+    tokio::spawn(async move { reach.serve_link(Box::new(theirs), &[], Box::pin(std::future::pending())).await });
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
     let mut held = Budget::without_limit().permit();
@@ -230,7 +229,7 @@ async fn stub(reach: &Arc<dyn Reach>, mut hello: Hello) -> Stub {
 
 impl Stub {
     async fn next_event(&mut self) -> StubEvent {
-        let told = timeout(LONG, self.told.recv()).await;
+        let told = timeout(PATIENCE, self.told.recv()).await;
         told.expect("something should be told").unwrap()
     }
 

@@ -15,7 +15,7 @@ use ros::ros1::master::{Master, MasterOptions};
 use tokio::time::timeout;
 
 /// Only limits the duration of a failing test.
-const LONG: Duration = Duration::from_secs(120);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Echoes requests; rejects the empty one and never answers `wait`.
 struct TapEchoService;
@@ -53,11 +53,11 @@ async fn world() -> TapWorld {
 
 async fn call_echo(bus: &Arc<dyn Bus>, request: &'static [u8]) -> Option<Bytes> {
     let request = Bytes::from_static(request);
-    bus.call("/echo", request, LONG).await.ok()
+    bus.call("/echo", request, PATIENCE).await.ok()
 }
 
 async fn next_event(tapping: &mut TapReceiver) -> TapEvent {
-    let told = timeout(LONG, tapping.told.recv()).await;
+    let told = timeout(PATIENCE, tapping.told.recv()).await;
     told.expect("in time").expect("somebody tells")
 }
 

@@ -9,10 +9,11 @@
 //! Names of the node itself are not arguments here: whoever starts the program sets them.
 
 use crate::bus::RosVersion;
+use crate::bus::parameter_names::{spell_in_ros1, spell_in_ros2};
 use crate::ros2::arguments::{self, BEGIN, END, Kind, RemapRule};
 
 /// Parameter of ROS 2 by which a node simulates its time. In ROS 1 it belongs to all nodes.
-const SIMULATED: &str = "use_sim_time";
+const SIM_TIME: &str = "use_sim_time";
 
 /// Arguments in the spelling of the other ROS.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -44,7 +45,7 @@ impl RespelledArguments {
             let words = match name.strip_prefix('_') {
                 // The node's name, namespace, log and address.
                 Some(special) if special.starts_with('_') => continue,
-                Some(parameter) => ["-p".to_owned(), format!("{}:={value}", parameter.replace('/', "."))],
+                Some(parameter) => ["-p".to_owned(), format!("{}:={value}", spell_in_ros2(parameter))],
                 None => ["-r".to_owned(), format!("{}:={}", name_in_ros2(name), name_in_ros2(value))],
             };
             // rcl ends the program because of a single argument that it does not accept.
@@ -76,8 +77,8 @@ impl RespelledArguments {
                     Some(remapping) => out.argv.push(remapping),
                     None => out.ignored.push(words),
                 },
-                Kind::Parameter(given) if given.is_for_other_node(node) || given.name == SIMULATED => {}
-                Kind::Parameter(given) => out.argv.push(format!("_{}:={}", given.name.replace('.', "/"), given.value)),
+                Kind::Parameter(given) if given.is_for_other_node(node) || given.name == SIM_TIME => {}
+                Kind::Parameter(given) => out.argv.push(format!("_{}:={}", spell_in_ros1(&given.name), given.value)),
                 Kind::File(_) | Kind::Setting => out.ignored.push(words),
                 Kind::Mark => {}
             }

@@ -11,9 +11,9 @@
 //! everything is registered again with a Master that was restarted or lost our registrations.
 
 mod actions;
+mod bus_info;
 mod calls;
 mod endpoint_owner;
-mod heard;
 mod lending;
 mod link;
 mod master_client;
@@ -134,7 +134,7 @@ impl Ros1Bus {
             publisher_clients: PublisherClients::default(),
             graph: watch::Sender::new(Arc::default()),
             shutdown: watch::Sender::new(None),
-            param_watcher: Mutex::default(),
+            param_watchers: Mutex::default(),
             closed: AtomicBool::new(false),
             runtime: Handle::current(),
             log_span: Span::current(),
@@ -151,7 +151,7 @@ impl Ros1Bus {
         inner.spawn(xmlrpc::serve(slave_listener, slave, limits));
         inner.spawn(server::serve(inner.clone(), tcpros_listener));
         let watcher = watcher::start(inner.clone()).await?;
-        inner.spawn(watcher.run());
+        inner.spawn(options.budget.meter(watcher.run()));
         Ok(bus)
     }
 
@@ -203,7 +203,7 @@ impl Ros1BusState {
 
     /// Subscribes to all parameter changes at the Master if there is a watcher.
     async fn subscribe_params(&self) -> Result<(), BusError> {
-        if self.param_watcher.lock().is_none() {
+        if self.param_watchers.lock().is_empty() {
             return Ok(());
         }
         let args = vec![self.registrar.slave_uri().into(), "/".into()];
@@ -232,7 +232,7 @@ impl Ros1BusState {
             topic.close();
         }
         self.publications.lock().clear();
-        *self.param_watcher.lock() = None;
+        self.param_watchers.lock().clear();
         self.services.lock().clear();
         self.lending.clear();
         self.calls.clear();
@@ -349,7 +349,8 @@ impl Bus for Ros1Bus {
             for (_, topic) in &publications {
                 topic.retire();
             }
-            if self.inner.param_watcher.lock().take().is_some() {
+            let is_watching = !std::mem::take(&mut *self.inner.param_watchers.lock()).is_empty();
+            if is_watching {
                 let args = vec![self.inner.registrar.slave_uri().into(), "/".into()];
                 let _ = self.inner.master.call("unsubscribeParam", args).await;
             }
@@ -366,7 +367,7 @@ impl Bus for Ros1Bus {
 #[async_trait]
 impl PublisherReports for Ros1Bus {
     async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
-        heard::connections(&self.inner, topic).await
+        bus_info::connections(&self.inner, topic).await
     }
 }
 

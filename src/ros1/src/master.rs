@@ -5,6 +5,7 @@
 //! everything in memory.
 
 mod api;
+mod changes;
 pub(crate) mod graph;
 pub(crate) mod lending;
 mod notify;
@@ -12,7 +13,7 @@ mod params;
 mod probe;
 mod registry;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::hash::{BuildHasher as _, RandomState};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -25,6 +26,8 @@ use tokio::sync::watch;
 
 use crate::actions;
 use crate::xmlrpc::{self, ServerLimits, Value};
+use changes::GraphChanges;
+use graph::{GraphAnswer, GraphPart, wire_generation};
 use lending::LenderSlot;
 use notify::{Notice, Notifier};
 use params::Params;
@@ -84,6 +87,7 @@ struct State {
     /// True if a recorded use has not been published yet.
     uses_changed: bool,
     sought: BTreeMap<String, Vec<String>>,
+    changes: GraphChanges,
 }
 
 impl Master {
@@ -135,8 +139,8 @@ impl Master {
         xmlrpc::serve(listener, handler, self.inner.limits.clone()).await;
     }
 
-    /// To be called when any process on the nodes' host has exited: finds nodes whose address nobody listens on any
-    /// more and drops their registrations. Returns their names.
+    /// Drops the registrations of nodes whose address nobody listens on any more, after any process on the nodes' host
+    /// has exited. Returns their names.
     pub async fn on_process_exit(&self) -> Vec<String> {
         probe::drop_dead(&self.inner).await
     }
@@ -154,6 +158,25 @@ impl Master {
     /// Returns the id of this Master since its first start; also parameter `/run_id`.
     pub fn run_id(&self) -> &str {
         &self.inner.run_id
+    }
+}
+
+impl State {
+    /// Copies a part of the graph into another; returns false if it is there no more.
+    fn copy_part(&self, part: &GraphPart, to: &mut Graph) -> bool {
+        fn insert<T>(to: &mut BTreeMap<String, T>, name: &str, value: Option<T>) -> bool {
+            let is_there = value.is_some();
+            to.extend(value.map(|value| (name.to_owned(), value)));
+            is_there
+        }
+        let registry = &self.registry;
+        match part {
+            GraphPart::Topic(name) => insert(&mut to.topics, name, registry.topic(name)),
+            GraphPart::Service(name) => insert(&mut to.services, name, registry.service_node(name).map(str::to_owned)),
+            GraphPart::Node(name) => insert(&mut to.nodes, name, registry.node_api(name).map(str::to_owned)),
+            GraphPart::Parameter(key) => insert(&mut to.parameters, key, self.uses.get(key).cloned()),
+            GraphPart::Sought(service) => insert(&mut to.sought, service, self.sought.get(service).cloned()),
+        }
     }
 }
 
@@ -182,6 +205,31 @@ impl MasterCore {
         }
     }
 
+    /// Returns the graph for a caller that knows a generation of this Master's: what has changed since, or the whole.
+    fn graph_answer(&self, known: Option<i32>) -> GraphAnswer {
+        let run_id = self.run_id.clone();
+        let differences = known.and_then(|known| {
+            let state = self.state.lock();
+            let now = *self.generation.borrow();
+            // The wire has the low bits of a generation.
+            let age = u64::from(wire_generation(now).wrapping_sub(known) as u32 & 0x7fff_ffff);
+            let parts = state.changes.parts_since(now.checked_sub(age)?)?;
+            let mut answer = GraphAnswer {
+                run_id: run_id.clone(),
+                graph: Graph { generation: now, ..Graph::default() },
+                since: Some(known),
+                gone: BTreeSet::new(),
+            };
+            for part in parts {
+                if !state.copy_part(&part, &mut answer.graph) {
+                    answer.gone.insert(part);
+                }
+            }
+            Some(answer)
+        });
+        differences.unwrap_or_else(|| GraphAnswer { run_id, graph: self.graph(), since: None, gone: BTreeSet::new() })
+    }
+
     fn is_known(&self, api: &str) -> bool {
         self.state.lock().registry.is_known(api)
     }
@@ -194,11 +242,19 @@ impl MasterCore {
         let result = by(&mut state, &mut notices);
         // Both while the state is locked: neither notices nor generations may overtake each other.
         if state.registry.version() != before {
+            let changed = state.registry.take_changed();
+            self.record_changes(&mut state, changed);
             self.bump_generation();
         }
         Notifier::send(self, notices);
         drop(state);
         result
+    }
+
+    /// Records that these parts change with the next generation; they have changed already.
+    fn record_changes(&self, state: &mut State, parts: impl IntoIterator<Item = GraphPart>) {
+        let next = *self.generation.borrow() + 1;
+        state.changes.record(next, parts);
     }
 
     fn bump_generation(&self) {
@@ -214,6 +270,7 @@ impl MasterCore {
         let nodes = if written { &mut used.written_by } else { &mut used.read_by };
         if nodes.len() < MAX_USERS && nodes.iter().all(|known| known != node) {
             nodes.push(node.to_owned());
+            self.record_changes(state, [GraphPart::Parameter(key.to_owned())]);
             if !std::mem::replace(&mut state.uses_changed, true) {
                 let master = Arc::clone(self);
                 tokio::spawn(async move {

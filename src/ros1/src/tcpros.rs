@@ -14,7 +14,7 @@ pub use header::{Header, MAX_HEADER};
 pub use send_queue::{SendQueue, write_messages};
 pub use service::{CallError, ServiceConnection, serve_calls};
 
-pub use ros_bus::{MAX_MESSAGE, UNFINISHED};
+pub use ros_bus::{MAX_MESSAGE, MESSAGE_TIMEOUT};
 
 /// Error of a TCPROS connection.
 #[derive(Debug, thiserror::Error)]

@@ -14,7 +14,7 @@ use crate::master::{Master, MasterOptions};
 use crate::xmlrpc::{Fault, ServerLimits, Value, XmlRpcClient, XmlRpcHandler, serve};
 
 /// Longer than anything here takes.
-pub(crate) const LONG: Duration = Duration::from_secs(120);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A Master that serves until dropped.
 pub(crate) struct TestMaster {
@@ -41,7 +41,7 @@ impl TestMaster {
     /// Calls a method; returns its `[code, message, value]`.
     pub(crate) async fn call(&self, method: &str, args: &[Value]) -> (i32, String, Value) {
         let client = XmlRpcClient::new(Arc::new(HostSockets), &format!("http://{}/", self.address));
-        let answer = client.unwrap().call(method, args, LONG).await.unwrap();
+        let answer = client.unwrap().call(method, args, PATIENCE).await.unwrap();
         match answer {
             Value::Array(parts) => match <[Value; 3]>::try_from(parts).unwrap() {
                 [Value::Int(code), Value::String(message), value] => (code, message, value),
@@ -55,7 +55,7 @@ impl TestMaster {
     pub(crate) async fn wait_until(&self, wanted: impl Fn(&ros_bus::Graph) -> bool) {
         let mut generation = self.master.generation();
         let waiting = generation.wait_for(|_| wanted(&self.master.graph()));
-        let found = tokio::time::timeout(LONG, waiting).await.is_ok();
+        let found = tokio::time::timeout(PATIENCE, waiting).await.is_ok();
         assert!(found, "{:#?}", self.master.graph());
     }
 
@@ -111,7 +111,7 @@ impl TestNode {
 
     /// Returns the next call received.
     pub(crate) async fn next(&mut self) -> (String, Vec<Value>) {
-        let call = tokio::time::timeout(LONG, self.calls.recv()).await;
+        let call = tokio::time::timeout(PATIENCE, self.calls.recv()).await;
         call.expect("a call should come").unwrap()
     }
 

@@ -16,7 +16,7 @@ use ros1::master::{Master, MasterOptions};
 use tokio::time::timeout;
 
 /// Time limit of a failing test only.
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 struct Echo;
 
@@ -63,11 +63,11 @@ async fn every_connection_notices_when_its_peer_is_gone() {
     let publisher = one.advertise("/said", wire_type.clone(), QosProfile::keep_last(1).latching(true)).await.unwrap();
     publisher.publish(Bytes::new());
     let mut subscription = two.subscribe("/said", wire_type, QosProfile::keep_last(1)).await.unwrap();
-    let heard = timeout(LONG, subscription.messages.recv()).await;
+    let heard = timeout(PATIENCE, subscription.messages.recv()).await;
     heard.unwrap().unwrap();
     let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _serving = one.serve("/echo", of, Arc::new(Echo)).await.unwrap();
-    let answer = two.call("/echo", Bytes::from_static(b"hi"), LONG).await;
+    let answer = two.call("/echo", Bytes::from_static(b"hi"), PATIENCE).await;
     assert_eq!(answer.unwrap(), "hi");
     two.parameters().unwrap().set("/p", ParamValue::Int(1)).await.unwrap();
     // A connection with unacknowledged data has another timer until that is acknowledged.
@@ -81,7 +81,7 @@ async fn every_connection_notices_when_its_peer_is_gone() {
         }
     };
     // The topic, the service and the Master, both ends of each, and the kept XML-RPC connections.
-    if timeout(LONG, quiet).await.is_err() {
+    if timeout(PATIENCE, quiet).await.is_err() {
         panic!("some are not asked after: {:?}", connections());
     }
 }

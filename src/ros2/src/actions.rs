@@ -12,6 +12,7 @@
 //! random UUID.
 
 mod client;
+pub mod goal_client;
 mod goal_id;
 pub mod goal_server;
 pub mod goal_services;

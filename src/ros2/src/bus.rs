@@ -71,7 +71,7 @@ impl Ros2Bus {
         let config = Config {
             user_data: Bytes::from_static(USER_DATA),
             max_sample: options.max_message,
-            budget: options.budget,
+            budget: options.budget.clone(),
             unfinished: options.unfinished,
             prefix: Some(prefix),
             predecessors: predecessors.into_iter().map(GuidPrefix).collect(),
@@ -107,7 +107,7 @@ impl Ros2Bus {
         });
         let mut watcher = Watcher::new(Arc::clone(&inner), teller);
         watcher.refresh();
-        inner.spawn(watcher.run());
+        inner.spawn(options.budget.meter(watcher.run()));
         Ok(Arc::new(Self { inner }))
     }
 

@@ -67,7 +67,7 @@ impl Component {
 
 /// Error of a container that did not load a node.
 #[derive(Debug, thiserror::Error)]
-#[error("the component container {container} does not load {}: {reason}", shown(.name, .plugin, .package))]
+#[error("the component container {container} does not load {}: {reason}", describe_component(.name, .plugin, .package))]
 pub struct NotLoaded {
     /// Absolute name of the container.
     pub container: String,
@@ -112,7 +112,7 @@ pub enum LoadFailure {
     Json(#[from] serde_json::Error),
 }
 
-fn shown(name: &Option<String>, plugin: &str, package: &str) -> String {
+fn describe_component(name: &Option<String>, plugin: &str, package: &str) -> String {
     let class = format!("{plugin} of package {package}");
     match name {
         Some(name) => format!("{name} ({class})"),

@@ -18,7 +18,7 @@ static KNOWN: LazyLock<Result<Registry, SchemaError>> = LazyLock::new(|| {
 });
 
 /// Returns a message by its full name.
-pub(super) fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
+pub fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
     lookup(name, |registry| registry.message(name))
 }
 

@@ -16,6 +16,7 @@ mod graph;
 pub mod interfaces;
 mod lending;
 pub mod lifecycle;
+pub mod middleware;
 pub mod names;
 mod node_ends;
 mod other_types;

@@ -5,6 +5,7 @@ pub mod reading;
 #[cfg(test)]
 mod tests;
 pub mod values;
+pub mod yaml;
 
 use std::slice;
 use std::time::Duration;

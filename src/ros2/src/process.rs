@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use ros_bus::parameter_names::spell_in_ros2;
 use ros_bus::{Naming, NodeIdentity, NodeRename, ParamValue, enclave_for};
 
 /// Domain of every servant's nodes, and of the bus that connects to them. Each servant has its own network, so all can
@@ -102,7 +103,7 @@ pub fn parameter_arguments(node: &str, all: &BTreeMap<String, ParamValue>) -> Ve
     let own = format!("{node}/");
     for (key, value) in all {
         if let Some(name) = key.strip_prefix(&own) {
-            flatten(&name.replace('/', "."), value, &mut given);
+            flatten(&spell_in_ros2(name), value, &mut given);
         }
     }
     let rules = given.iter();

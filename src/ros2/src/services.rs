@@ -1,6 +1,7 @@
 //! Services that this node serves.
 
 use std::sync::Arc;
+use std::task::{Context, Waker};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -164,7 +165,11 @@ async fn answer_all(
             calls.join_next().await;
         }
         let answering = Arc::clone(&answering);
-        calls.spawn(async move { answering.answer(sample).await });
+        let mut call = Box::pin(async move { answering.answer(sample).await });
+        // Calls begin in the order of their requests; tasks would not.
+        if call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending() {
+            calls.spawn(call);
+        }
     }
     while calls.try_join_next().is_some() {}
     let late = !calls.is_empty();

@@ -25,7 +25,7 @@ pub enum ActionEndpoint {
     GetResult,
 }
 
-const OF_ONE: [(ActionEndpoint, &str); 5] = [
+const ROS1_TOPICS: [(ActionEndpoint, &str); 5] = [
     (ActionEndpoint::Goal, "goal"),
     (ActionEndpoint::Cancel, "cancel"),
     (ActionEndpoint::Feedback, "feedback"),
@@ -71,7 +71,7 @@ impl ActionEndpoint {
 /// Returns the topics and services of an action with their names.
 pub fn action_endpoints(version: RosVersion, action: &str) -> Vec<(ActionEndpoint, String)> {
     let (ends, name): (_, fn(&str, &str) -> String) = match version {
-        RosVersion::One => (OF_ONE, |action, end| format!("{action}/{end}")),
+        RosVersion::One => (ROS1_TOPICS, |action, end| format!("{action}/{end}")),
         RosVersion::Two => (OF_TWO, action_part_name),
     };
     ends.map(|(end, part)| (end, name(action, part))).into()
@@ -80,7 +80,7 @@ pub fn action_endpoints(version: RosVersion, action: &str) -> Vec<(ActionEndpoin
 /// Splits the name of a topic or service that may be part of an action into the action and the part.
 pub fn split_action_endpoint(version: RosVersion, name: &str) -> Option<(&str, ActionEndpoint)> {
     let (ends, (action, part)) = match version {
-        RosVersion::One => (OF_ONE, name.rsplit_once('/').filter(|(action, _)| !action.is_empty())?),
+        RosVersion::One => (ROS1_TOPICS, name.rsplit_once('/').filter(|(action, _)| !action.is_empty())?),
         RosVersion::Two => (OF_TWO, action_part(name)?),
     };
     let (end, _) = ends.into_iter().find(|(_, known)| *known == part)?;

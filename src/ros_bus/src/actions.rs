@@ -112,6 +112,11 @@ pub trait ActionClient: Send + Sync {
 pub trait ActionHandler: Send + Sync + 'static {
     /// A goal arrived; an error rejects it.
     fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason>;
+    /// Returns whether goals that `on_goal` did not reject are accepted only later, by [`ActionServer::accept_goal`] or
+    /// [`ActionServer::execute_goal`], or rejected, by [`ActionServer::end_goal`].
+    fn is_answer_deferred(&self) -> bool {
+        false
+    }
     /// An accepted goal is to be cancelled.
     fn on_cancel(&self, id: &str);
     /// The action cannot be served.
@@ -120,6 +125,10 @@ pub trait ActionHandler: Send + Sync + 'static {
 
 /// An action that this bus serves; dropping it aborts the active goals.
 pub trait ActionServer: Send + Sync {
+    /// Accepts a goal whose answer was deferred, and which waits to be executed.
+    fn accept_goal(&self, id: &str);
+    /// Reports that such a goal is executed, and accepts it unless that was done before.
+    fn execute_goal(&self, id: &str);
     /// Publishes feedback for a goal; returns false if no goal with this id is active.
     fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool;
     /// Ends a goal; returns false if no goal with this id is active.

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::{Deserialize, Serialize};
+
 use crate::hidden_names::action_part_name;
 use crate::{QosProfile, ServiceType, WireType, enclave_for, linked_node};
 
@@ -158,13 +160,17 @@ impl NodeEntities {
 }
 
 /// Names of the endpoints of a node.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct NodeNames {
     /// Published topics.
+    #[serde(rename = "outputs")]
     pub publishes: BTreeSet<String>,
     /// Subscribed topics.
+    #[serde(rename = "inputs")]
     pub subscribes: BTreeSet<String>,
     /// Served services.
+    #[serde(rename = "services")]
     pub serves: BTreeSet<String>,
 }
 

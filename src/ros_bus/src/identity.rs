@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 /// Prefix of a process's enclave, before the name of the robot's node.
-const LINKED: &str = "/cloudroid_link";
+const LINK_ENCLAVE: &str = "/cloudroid_link";
 /// Maximum length of the name of a node that is marked by its enclave.
-const MAX_MARKED: usize = 200;
+const MAX_NAME_LENGTH: usize = 200;
 
 /// Arguments and environment that set a program's node name or namespace.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -44,12 +44,12 @@ pub struct NodeRename {
 /// Returns the enclave of a process that runs as the robot's node of this name (ROS 2); it identifies all nodes of the
 /// process, whatever their names. `None` if it would be longer than rcl allows.
 pub fn enclave_for(node: &str) -> Option<String> {
-    (node.len() <= MAX_MARKED).then(|| format!("{LINKED}{node}"))
+    (node.len() <= MAX_NAME_LENGTH).then(|| format!("{LINK_ENCLAVE}{node}"))
 }
 
 /// Returns the name of the robot's node that a process with this enclave runs as; `None` for other enclaves.
 pub fn linked_node(enclave: &str) -> Option<&str> {
-    enclave.strip_prefix(LINKED).filter(|node| node.starts_with('/'))
+    enclave.strip_prefix(LINK_ENCLAVE).filter(|node| node.starts_with('/'))
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use crate::succession::Succession;
 /// Default size limit of a message, in bytes; a longer one ends its connection.
 pub const MAX_MESSAGE: usize = 256 << 20;
 /// Default time limit for receiving a message once it has begun; exceeding it ends the connection.
-pub const UNFINISHED: Duration = Duration::from_secs(300);
+pub const MESSAGE_TIMEOUT: Duration = Duration::from_secs(300);
 
 /// Options for joining a ROS system.
 #[derive(Debug, Clone)]
@@ -23,7 +23,7 @@ pub struct JoinOptions {
     pub domain: u16,
     /// Value of `$ROS_DISTRO`, which ROS 2 does not announce; may be empty.
     pub distribution: String,
-    /// How other nodes are discovered (ROS 2).
+    /// Discovery of other nodes (ROS 2).
     pub network: DiscoveryNetwork,
     /// Absolute name of the node.
     pub node: String,
@@ -51,7 +51,7 @@ impl JoinOptions {
             host: None,
             max_message: MAX_MESSAGE,
             budget: Budget::without_limit(),
-            unfinished: UNFINISHED,
+            unfinished: MESSAGE_TIMEOUT,
             succession: None,
         }
     }

@@ -41,7 +41,7 @@ pub trait Lender: Send + Sync + 'static {
 /// Lending of services from one ROS system to another. ROS 1 offers it only with our own Master.
 #[async_trait]
 pub trait Lending: Send + Sync {
-    /// From now on, nodes also find the lender's services. Services of this system always take precedence. Lent
+    /// Lets nodes find the lender's services from now on. Services of this system always take precedence. Lent
     /// services are not registered: they can be looked up, called and waited for, but are not listed. There is one
     /// lender at a time.
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError>;

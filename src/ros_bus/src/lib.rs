@@ -26,10 +26,11 @@ mod identity;
 mod inquiries;
 mod join;
 mod lending;
-mod matched;
+mod matched_endpoints;
 pub mod net;
 mod network;
 mod node_parameters;
+pub mod parameter_names;
 mod parameters;
 mod qos;
 mod queue;
@@ -46,9 +47,9 @@ pub use failure_reason::FailureReason;
 pub use graph::{ActionNodes, Graph, NodeEntities, NodeNames, ParameterUse, TopicNodes};
 pub use identity::{Naming, NodeIdentity, NodeRename, enclave_for, linked_node};
 pub use inquiries::TypeInquiries;
-pub use join::{JoinOptions, MAX_MESSAGE, UNFINISHED};
+pub use join::{JoinOptions, MAX_MESSAGE, MESSAGE_TIMEOUT};
 pub use lending::{Lender, Lending, LentService, ServiceProvider};
-pub use matched::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
+pub use matched_endpoints::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
 pub use network::{DiscoveryNetwork, DiscoveryServer, InterfaceAddress, InterfaceSelection};
 pub use node_parameters::{
     DoubleRange, IntegerRange, NodeParameters, ParameterDescription, ParameterEvent, ParameterEvents, ParameterKind,

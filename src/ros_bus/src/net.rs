@@ -54,12 +54,12 @@ const AF_NETLINK: i32 = 16;
 const NETLINK_SOCK_DIAG: i32 = 4;
 
 /// Idle time after which the kernel probes whether a peer is still there.
-const ASK: Duration = Duration::from_secs(20);
+const KEEPALIVE_IDLE: Duration = Duration::from_secs(20);
 /// Interval between unanswered probes.
-const ASK_AGAIN: Duration = Duration::from_secs(10);
+const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(10);
 /// Time without an answer after which a peer counts as gone. It is also the time for which sent data may stay
 /// unacknowledged: a peer that does not read for this long loses its connection.
-const GONE: Duration = Duration::from_secs(60);
+const PEER_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Makes the kernel end the connection when the peer vanishes silently because its machine lost power or its network.
 /// Otherwise a side that only reads would wait forever, and one that writes for a quarter of an hour.
@@ -67,8 +67,8 @@ const GONE: Duration = Duration::from_secs(60);
 /// An idle but live peer is not affected: its kernel answers the probes, even while its process is stopped.
 pub fn enable_keepalive(stream: &TcpStream) {
     let socket = SockRef::from(stream);
-    let asking = TcpKeepalive::new().with_time(ASK).with_interval(ASK_AGAIN);
-    let asked = socket.set_tcp_keepalive(&asking).and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
+    let asking = TcpKeepalive::new().with_time(KEEPALIVE_IDLE).with_interval(KEEPALIVE_INTERVAL);
+    let asked = socket.set_tcp_keepalive(&asking).and_then(|()| socket.set_tcp_user_timeout(Some(PEER_TIMEOUT)));
     if let Err(error) = asked {
         tracing::debug!(%error, "a peer that disappears silently will not be noticed");
     }
@@ -221,8 +221,8 @@ mod tests {
         enable_keepalive(&stream);
         let socket = SockRef::from(&stream);
         assert!(socket.keepalive().unwrap());
-        assert_eq!(socket.tcp_keepalive_time().unwrap(), ASK);
-        assert_eq!(socket.tcp_keepalive_interval().unwrap(), ASK_AGAIN);
-        assert_eq!(socket.tcp_user_timeout().unwrap(), Some(GONE));
+        assert_eq!(socket.tcp_keepalive_time().unwrap(), KEEPALIVE_IDLE);
+        assert_eq!(socket.tcp_keepalive_interval().unwrap(), KEEPALIVE_INTERVAL);
+        assert_eq!(socket.tcp_user_timeout().unwrap(), Some(PEER_TIMEOUT));
     }
 }

@@ -65,7 +65,7 @@ pub struct DiscoveryServer {
     pub at: SocketAddr,
 }
 
-/// Where a node discovers others and is discovered by them (ROS 2). The default is a servant's network, which has
+/// Network in which a node and others discover each other (ROS 2). The default is a servant's network, which has
 /// nothing but `lo`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DiscoveryNetwork {

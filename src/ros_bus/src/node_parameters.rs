@@ -58,7 +58,7 @@ pub struct ParameterNames {
 /// Type of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ParameterKind {
-    /// Not set.
+    /// The parameter is not set.
     #[default]
     NotSet,
     /// `true` or `false`.

@@ -29,8 +29,8 @@ pub trait GlobalParameters: Send + Sync {
     async fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
     /// Returns the keys of all parameters that are set.
     async fn names(&self) -> Result<Vec<String>, BusError>;
-    /// Watches every change of any parameter from now on, including changes made by this bus. There is one watcher at a
-    /// time; a new one replaces it.
+    /// Watches every change of any parameter from now on, including changes made by this bus. Where the parameters are
+    /// those of nodes of ROS 2, an earlier watch ends.
     async fn watch(&self) -> Result<ParamChangeReceiver, BusError>;
 }
 

@@ -22,13 +22,13 @@ pub enum QosDurability {
     TransientLocal,
 }
 
-/// How a publisher's liveliness is asserted.
+/// Way in which a publisher asserts its liveliness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum QosLiveliness {
-    /// By ROS, for as long as the node exists.
+    /// ROS asserts it for as long as the node exists.
     #[default]
     Automatic,
-    /// By the publisher, by publishing.
+    /// The publisher asserts it by publishing.
     ManualByTopic,
 }
 
@@ -47,7 +47,7 @@ pub struct QosProfile {
     pub deadline: Option<Duration>,
     /// Time after which a message is obsolete; `None` if it never is.
     pub lifespan: Option<Duration>,
-    /// How the publisher's liveliness is asserted.
+    /// Way in which the publisher asserts its liveliness.
     pub liveliness: QosLiveliness,
     /// Liveliness lease duration; `None` if unspecified.
     pub lease: Option<Duration>,

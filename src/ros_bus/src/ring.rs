@@ -44,7 +44,7 @@ impl RingBounds {
 pub struct DropTally {
     /// Number of messages.
     pub messages: u64,
-    /// Their size in bytes.
+    /// Total size of the messages in bytes.
     pub bytes: u64,
 }
 
@@ -88,15 +88,18 @@ pub struct Ring<T> {
     bytes: usize,
 }
 
+impl<T> Default for Ring<T> {
+    /// Creates an empty ring that drops messages only at its owner's request.
+    fn default() -> Self {
+        let bounds = RingBounds { messages: usize::MAX, bytes: usize::MAX };
+        Self { bounds, waiting: VecDeque::new(), bytes: 0 }
+    }
+}
+
 impl<T: RingItem> Ring<T> {
     /// Creates an empty ring.
     pub fn new(bounds: RingBounds) -> Self {
         Self { bounds, waiting: VecDeque::new(), bytes: 0 }
-    }
-
-    /// Creates an empty ring that drops messages only at its owner's request.
-    pub fn new_unbounded() -> Self {
-        Self::new(RingBounds { messages: usize::MAX, bytes: usize::MAX })
     }
 
     /// Adds a message at the end; drops the oldest ones if there is no room.

@@ -19,7 +19,7 @@ enum QueueState {
     None,
     Ready,
     Later(Instant),
-    /// Not scheduled until it is released.
+    /// The queue is not scheduled until it is released.
     Held,
 }
 

@@ -50,7 +50,7 @@ use crate::RosVersion;
 use crate::schema::MessageType;
 
 pub use cbor_item::cbor_item_len;
-pub use fault::{CodecError, CodecErrorKind};
+pub use fault::{CodecError, CodecErrorKind, Fault};
 pub use json_text::json_value_len;
 pub use options::{CborOptions, DEFAULT_MAX_BYTES, FillOptions, FillReport, InvalidUtf8, JsonOptions, NonFinite, Time};
 pub use stamps::Stamps;
@@ -98,7 +98,7 @@ pub fn from_cbor(
 
 /// Checks that the bytes are exactly one message of this type.
 pub fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), CodecError> {
-    walk::validate(message, bytes).map_err(|fault| fault.into_codec_error(message))
+    walk::validate(message, bytes).map_err(|fault| fault.into_codec_error(message.name()))
 }
 
 /// Returns the default message, serialized: zeros, empty strings and arrays, or the default values of a ROS 2
@@ -140,11 +140,11 @@ pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
 fn undo_on_error<T>(
     message: &MessageType,
     out: &mut Vec<u8>,
-    convert: impl FnOnce(&mut Vec<u8>) -> Result<T, fault::Fault>,
+    convert: impl FnOnce(&mut Vec<u8>) -> Result<T, Fault>,
 ) -> Result<T, CodecError> {
     let before = out.len();
     convert(out).map_err(|fault| {
         out.truncate(before);
-        fault.into_codec_error(message)
+        fault.into_codec_error(message.name())
     })
 }

@@ -12,7 +12,7 @@ use crate::schema::MessageType;
 pub use extent::Extent;
 
 /// Maximum number of inputs tracked, because clients choose topic names.
-const MOST: usize = 64;
+const MAX_INPUTS: usize = 64;
 /// Number of size classes per power of two.
 const PARTS: usize = 4;
 
@@ -120,7 +120,7 @@ impl InputSizes {
             }
         }
         let sizes = Arc::new(SizeCounters::for_type(message));
-        if by_name.len() < MOST || by_name.contains_key(name) {
+        if by_name.len() < MAX_INPUTS || by_name.contains_key(name) {
             let entry = (digest.to_owned(), Arc::clone(&sizes));
             by_name.insert(name.to_owned(), entry);
         }
@@ -175,10 +175,10 @@ mod tests {
     #[test]
     fn clients_cannot_make_it_grow() {
         let inputs = InputSizes::default();
-        for number in 0..2 * MOST {
+        for number in 0..2 * MAX_INPUTS {
             inputs.for_input(&format!("/topic{number}"), None).record(b"");
         }
-        assert_eq!(inputs.summaries().len(), MOST);
+        assert_eq!(inputs.summaries().len(), MAX_INPUTS);
         let late = inputs.for_input("/topic0", None);
         late.record(b"");
         assert_eq!(inputs.summaries()[0].1.count, 2, "those there are go on");

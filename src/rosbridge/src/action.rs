@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use crate::kinds::{
+use crate::field_kinds::{
     ACTION, ACTION_TYPE, AnyValue, Arguments, Encoding, Flag, FrameSize, GOAL_ID, GoalStatusNumber, MessageObject,
     OptionalEncoding, OptionalId, Outcome,
 };

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use crate::kinds::{Flag, MESSAGE_TYPE, OptionalCount, OptionalId, OptionalText, Qos, TOPIC, Text};
+use crate::field_kinds::{Flag, MESSAGE_TYPE, OptionalCount, OptionalId, OptionalText, Qos, TOPIC, Text};
 use crate::message::message;
 use crate::{Id, QosRequest};
 

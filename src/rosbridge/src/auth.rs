@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::Id;
-use crate::kinds::{Integer, OptionalId, Text};
+use crate::field_kinds::{Integer, OptionalId, Text};
 use crate::message::message;
 
 const SECONDS: Integer = Integer("seconds since 1970");

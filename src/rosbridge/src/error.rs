@@ -34,7 +34,7 @@ impl From<Problem> for Error {
 /// Kinds of mistakes in a frame.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Problem {
-    /// Not JSON, or not CBOR.
+    /// The frame is not JSON, or not CBOR.
     #[error("invalid {format} at byte {at}: {reason}")]
     Syntax {
         /// `JSON` or `CBOR`.

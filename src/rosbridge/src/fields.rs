@@ -69,11 +69,11 @@ impl<'a> Fields<'a> {
 
     /// Describes a value for error messages, shortened.
     pub(crate) fn describe(&self, value: &[u8]) -> String {
-        const SHOWN: usize = 48;
+        const MAX_SHOWN_LENGTH: usize = 48;
         match self.format {
             Format::Json => {
                 let text = String::from_utf8_lossy(value);
-                match text.char_indices().nth(SHOWN) {
+                match text.char_indices().nth(MAX_SHOWN_LENGTH) {
                     Some((at, _)) => format!("{}…", &text[..at]),
                     None => text.into_owned(),
                 }
@@ -84,7 +84,7 @@ impl<'a> Fields<'a> {
                 }
                 cbor::BYTES => "a byte string".to_owned(),
                 cbor::TEXT => match cbor::CborCursor::new(value).string(cbor::TEXT) {
-                    Some(text) => format!("{:?}", String::from_utf8_lossy(&text[..text.len().min(SHOWN)])),
+                    Some(text) => format!("{:?}", String::from_utf8_lossy(&text[..text.len().min(MAX_SHOWN_LENGTH)])),
                     None => "a text in chunks".to_owned(),
                 },
                 cbor::ARRAY => "an array".to_owned(),

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use crate::Id;
-use crate::kinds::{Count, Data, RequiredId};
+use crate::field_kinds::{Count, Data, RequiredId};
 use crate::message::message;
 
 message! {

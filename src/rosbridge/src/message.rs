@@ -17,9 +17,9 @@ pub(crate) trait Message<'a>: Sized {
     fn write(&self, writer: &mut Writer<'_>);
 }
 
-/// Declares an op: its name, the kind of its id, and the name and kind (see [`kinds`](crate::kinds)) of each field on
-/// the wire, in the order in which they are written. `ignores` lists fields that clients may send and the server does
-/// not use. `id: … => field` states that old clients append the id to that name.
+/// Declares an op: its name, the kind of its id, and the name and kind of each field on the wire (see
+/// [`field_kinds`](crate::field_kinds)), in the order in which they are written. `ignores` lists fields that clients
+/// may send and the server does not use. `id: … => field` states that old clients append the id to that name.
 macro_rules! message {
     (
         $(#[$doc:meta])*
@@ -44,19 +44,19 @@ macro_rules! message {
                 id: Option<$crate::Id<'a>>,
                 fields: &$crate::fields::Fields<'a>,
             ) -> Result<Self, $crate::Problem> {
-                use $crate::kinds::{FieldKind, IdKind};
+                use $crate::field_kinds::{FieldKind, IdKind};
                 $(let $field = $kind.read(fields, $key)?;)*
                 $(let ($named, id) = $crate::id::split_name($named, id);)?
                 Ok(Self { id: $id_kind.read(id)?, $($field,)* })
             }
 
             fn id(&self) -> Option<&$crate::Id<'a>> {
-                use $crate::kinds::IdKind;
+                use $crate::field_kinds::IdKind;
                 $id_kind.get(&self.id)
             }
 
             fn write(&self, writer: &mut $crate::Writer<'_>) {
-                use $crate::kinds::FieldKind;
+                use $crate::field_kinds::FieldKind;
                 $($kind.write(&self.$field, writer, $key);)*
             }
         }

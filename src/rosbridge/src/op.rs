@@ -13,9 +13,9 @@ use crate::{
 /// One WebSocket message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ProtocolFrame<'a> {
-    /// A text frame: JSON.
+    /// JSON, as in a text frame.
     Text(&'a str),
-    /// A binary frame: CBOR.
+    /// CBOR, as in a binary frame.
     Binary(&'a [u8]),
 }
 
@@ -28,7 +28,7 @@ macro_rules! ops {
         }
 
         /// Names of all ops.
-        const KNOWN: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
+        const OP_NAMES: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
 
         impl<'a> Op<'a> {
             fn read(op: &str, id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
@@ -37,7 +37,7 @@ macro_rules! ops {
                 })*
                 Err(Problem::UnknownOp {
                     op: op.chars().take(64).collect(),
-                    known: KNOWN,
+                    known: OP_NAMES,
                 })
             }
 
@@ -138,7 +138,7 @@ impl<'a> Op<'a> {
                 } else {
                     ""
                 };
-                return Err(Error { op: None, id: known, problem: Problem::NoOp { known: KNOWN, hint } });
+                return Err(Error { op: None, id: known, problem: Problem::NoOp { known: OP_NAMES, hint } });
             }
             Err(problem) => {
                 return Err(Error { op: None, id: known, problem });
@@ -153,6 +153,12 @@ impl<'a> Op<'a> {
 }
 
 impl<'a> ProtocolFrame<'a> {
+    /// Returns what a binary frame contains. Some clients send their JSON so; it begins as no CBOR map does.
+    pub fn from_binary(bytes: &'a [u8]) -> Self {
+        let text = bytes.starts_with(b"{").then(|| std::str::from_utf8(bytes).ok()).flatten();
+        text.map_or(Self::Binary(bytes), Self::Text)
+    }
+
     /// Returns the frame as one payload.
     pub fn payload(self) -> Payload<'a> {
         match self {
@@ -169,7 +175,7 @@ impl<'a> ProtocolFrame<'a> {
 
 /// Returns whether the protocol has this op.
 pub fn is_known_op(op: &str) -> bool {
-    KNOWN.contains(&op)
+    OP_NAMES.contains(&op)
 }
 
 /// Reads a short string field of a frame, even of one that [`Op::parse`] refuses; `None` if the field is absent or
@@ -209,7 +215,7 @@ pub(crate) mod tests {
         let (_, table) = table.expect("the table of operations");
         let rows = table.lines().skip(1).take_while(|line| !line.is_empty());
         let mut named: Vec<&str> = rows.flat_map(|row| row.split('`').skip(1).step_by(2)).collect();
-        let mut known = KNOWN.to_vec();
+        let mut known = OP_NAMES.to_vec();
         named.sort_unstable();
         known.sort_unstable();
         assert_eq!(named, known);
@@ -240,6 +246,19 @@ pub(crate) mod tests {
     #[track_caller]
     pub(crate) fn assert_refused(json: &str, text: &str) {
         assert_eq!(Op::parse(ProtocolFrame::Text(json)).unwrap_err().to_string(), text, "{json}");
+    }
+
+    #[test]
+    fn a_binary_frame_has_cbor_or_json() {
+        let mut printed = Vec::new();
+        let op = Op::from(Unsubscribe { id: None, topic: "/x".into() });
+        for format in [Format::Json, Format::Cbor] {
+            printed.clear();
+            op.print(&mut printed, format);
+            let frame = ProtocolFrame::from_binary(&printed);
+            assert_eq!((frame.format(), Op::parse(frame).as_ref()), (format, Ok(&op)));
+        }
+        assert_eq!(ProtocolFrame::from_binary(b"{\xff").format(), Format::Cbor);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use crate::kinds::{Encoding, Flag, MESSAGE_TYPE, MessageOrEmpty, OptionalId, OptionalText, Qos, TOPIC};
+use crate::field_kinds::{Encoding, Flag, MESSAGE_TYPE, MessageOrEmpty, OptionalId, OptionalText, Qos, TOPIC};
 use crate::message::{Message, message};
 use crate::{Compression, Format, Id, Payload, QosRequest, Writer};
 

@@ -36,9 +36,9 @@ pub enum ReliabilityPolicy {
 /// Messages delivered to new subscribers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum DurabilityPolicy {
-    /// Also those published earlier.
+    /// New subscribers also get messages published earlier.
     TransientLocal,
-    /// Only those published from then on.
+    /// New subscribers get only messages published from then on.
     Volatile,
     /// The better one that the existing endpoints support.
     BestAvailable,

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::time::Duration;
 
-use crate::kinds::{
+use crate::field_kinds::{
     AnyValue, Arguments, Encoding, FrameSize, OptionalEncoding, OptionalId, OptionalText, Outcome, SERVICE,
     SERVICE_TYPE, Seconds, Text,
 };

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::Id;
-use crate::kinds::{Data, Level, OptionalId};
+use crate::field_kinds::{Data, Level, OptionalId};
 use crate::message::message;
 
 /// Severity of a status message; in `set_level` the least severe level to send.
@@ -14,9 +14,9 @@ pub enum StatusLevel {
     /// Failures.
     #[default]
     Error,
-    /// Also unusual events that are not failures.
+    /// Failures, and unusual events that are none.
     Warning,
-    /// Also successes.
+    /// All of these, and successes.
     Info,
 }
 

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::time::Duration;
 
-use crate::kinds::{
+use crate::field_kinds::{
     Encoding, FrameSize, MESSAGE_TYPE, Milliseconds, OptionalId, OptionalText, Qos, QueueLength, TOPIC,
 };
 use crate::message::message;

@@ -37,7 +37,7 @@ const NO_ROOM: Duration = Duration::from_millis(1);
 /// Maximum length of a datagram.
 const LONGEST: usize = 65_536;
 /// Length below which a datagram is copied out of the buffer; a longer one takes the buffer with it.
-const COPIED: usize = 16 << 10;
+const MAX_COPIED: usize = 16 << 10;
 
 /// State protected by one lock.
 pub(crate) struct Core {
@@ -203,7 +203,7 @@ impl DriverState {
             let Ok((length, source)) = received else {
                 break;
             };
-            let datagram = if length <= COPIED {
+            let datagram = if length <= MAX_COPIED {
                 Bytes::copy_from_slice(&buffer[..length])
             } else {
                 buffer.truncate(length);

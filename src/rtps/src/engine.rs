@@ -35,7 +35,7 @@ use tokio::sync::watch;
 pub(crate) use self::discovering::BUILTIN;
 use self::paths::DestinationQueue;
 use self::predecessors::Predecessors;
-use self::servers::DiscoverySource;
+use self::servers::{DiscoverySource, Repetition};
 use crate::discovery::ParticipantData;
 use crate::locator::Ports;
 use crate::network::InterfaceSet;
@@ -75,7 +75,7 @@ struct RemoteParticipant {
     discovery: SocketAddr,
     /// Default address of its endpoints.
     user: SocketAddr,
-    /// How it was discovered.
+    /// Source of its discovery.
     via: DiscoverySource,
     heard: Instant,
     /// Time at which it was first pinged since it was last heard.
@@ -137,6 +137,8 @@ pub(crate) struct Engine {
     /// Sequence numbers of the samples that announce local endpoints, and of those that dispose of them.
     announced: HashMap<EntityId, SequenceNumber>,
     withdrawn: VecDeque<(EntityId, SequenceNumber)>,
+    /// Local endpoints that are announced to servers again, because a match is not confirmed.
+    repetitions: HashMap<EntityId, Repetition>,
     next_entity: u32,
     /// Endpoints whose [`EndpointMatches`] have changed.
     changed_ends: BTreeSet<EntityId>,
@@ -174,6 +176,7 @@ impl Engine {
             readers: HashMap::new(),
             announced: HashMap::new(),
             withdrawn: VecDeque::new(),
+            repetitions: HashMap::new(),
             next_entity: 1,
             changed_ends: BTreeSet::new(),
             control: VecDeque::new(),
@@ -213,7 +216,7 @@ impl Engine {
         std::mem::take(&mut self.deliveries)
     }
 
-    /// Does what is due.
+    /// Performs the operations that are due.
     pub fn tick(&mut self, now: Instant) {
         let mut again = self.tick_discovery(now);
         let mut answers = Vec::new();

@@ -14,9 +14,9 @@ use socket2::Socket;
 use crate::pace::Pacer;
 
 /// Fraction of a receiver's buffer that is used at most; the rest is left to other senders.
-const PART: (usize, usize) = (5, 8);
+const BUFFER_SHARE: (usize, usize) = (5, 8);
 /// Bytes that may be sent without a query after a pause, to a receiver that had room: a small part of any buffer.
-const UNASKED: usize = 8 << 10;
+const UNQUERIED_BYTES: usize = 8 << 10;
 /// Time for which the result of a query is valid.
 const RECENT: Duration = Duration::from_millis(1);
 /// Time after which a full receiver is queried again.
@@ -107,9 +107,9 @@ impl FlowControl {
     fn reserve_credit(&mut self, now: Instant, address: SocketAddrV4, length: usize) -> bool {
         let to = SocketAddr::V4(address);
         let cost = (length + OVERHEAD).next_power_of_two() + RECORD;
-        let credit = self.credits.entry(to).or_insert(Credit { bytes: UNASKED, asked: now, full: false });
+        let credit = self.credits.entry(to).or_insert(Credit { bytes: UNQUERIED_BYTES, asked: now, full: false });
         if !credit.full && now.saturating_duration_since(credit.asked) > RECENT {
-            *credit = Credit { bytes: credit.bytes.max(UNASKED), asked: now, full: false };
+            *credit = Credit { bytes: credit.bytes.max(UNQUERIED_BYTES), asked: now, full: false };
         }
         if credit.bytes >= cost {
             credit.bytes -= cost;
@@ -120,7 +120,7 @@ impl FlowControl {
             // Nobody is there, or the kernel does not answer: nothing to wait for.
             Ok(None) | Err(_) => return true,
         };
-        let free = (buffer / PART.1 * PART.0).saturating_sub(queued);
+        let free = (buffer / BUFFER_SHARE.1 * BUFFER_SHARE.0).saturating_sub(queued);
         let fits = free >= cost || queued == 0;
         let bytes = free.saturating_sub(if fits { cost } else { 0 });
         self.credits.insert(to, Credit { bytes: if fits { bytes } else { 0 }, asked: now, full: !fits });

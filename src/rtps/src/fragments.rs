@@ -24,7 +24,7 @@ const MOST_ASIDE: usize = 4096;
 const KEEPING: usize = 128;
 /// Length below which an out-of-order fragment is copied; otherwise it would keep its whole datagram, which may be much
 /// longer.
-const COPIED: usize = 32 << 10;
+const MAX_COPIED: usize = 32 << 10;
 
 /// An incomplete sample. Its memory grows with the bytes received, not with the announced size, and is charged to the
 /// budget.
@@ -132,7 +132,7 @@ impl Assembly {
             return false;
         }
         self.held_aside += held;
-        let bytes = if bytes.len() < COPIED { Bytes::copy_from_slice(&bytes) } else { bytes };
+        let bytes = if bytes.len() < MAX_COPIED { Bytes::copy_from_slice(&bytes) } else { bytes };
         self.aside.insert(number, bytes);
         true
     }

@@ -15,20 +15,20 @@ const BURST: f64 = 48.0 * 1024.0;
 /// Ratio of the pace to the recent average rate: half of the time is left for repairs.
 const AHEAD: f64 = 2.0;
 /// Minimum pace in bytes per second, so that single samples do not take long: 0.4 Gbit/s.
-const LEAST: f64 = 50e6;
+const MIN_PACE: f64 = 50e6;
 /// Maximum pace in bytes per second.
-const MOST: f64 = 1.25e9;
+const MAX_PACE: f64 = 1.25e9;
 /// Averaging time in seconds.
 const LATELY: f64 = 0.5;
 /// Fraction of repeated bytes above which the pace is too high.
-const LOST: f64 = 0.05;
+const MAX_REPEATED_SHARE: f64 = 0.05;
 /// Interval and factors of adjusting the pace, and its lowest fraction.
-const JUDGED: Duration = Duration::from_millis(50);
+const ADJUST_INTERVAL: Duration = Duration::from_millis(50);
 const SLOWER: f64 = 0.7;
 const FASTER: f64 = 1.1;
 const SLOWEST: f64 = 0.25;
 /// Time after which idle receivers are forgotten.
-const FORGOTTEN: Duration = Duration::from_secs(10);
+const RECEIVER_EXPIRY: Duration = Duration::from_secs(10);
 
 /// Token bucket of one receiver.
 #[derive(Debug, Clone, Copy)]
@@ -47,16 +47,16 @@ struct TokenBucket {
 
 impl TokenBucket {
     fn rate(&self) -> f64 {
-        (self.sent * AHEAD).clamp(LEAST, MOST) * self.part
+        (self.sent * AHEAD).clamp(MIN_PACE, MAX_PACE) * self.part
     }
 
     /// Slows down while much is lost, and recovers while little is.
     fn adjust_rate(&mut self, now: Instant) {
-        if now.saturating_duration_since(self.judged) < JUDGED {
+        if now.saturating_duration_since(self.judged) < ADJUST_INTERVAL {
             return;
         }
         self.judged = now;
-        let change = if self.again > self.sent * LOST { SLOWER } else { FASTER };
+        let change = if self.again > self.sent * MAX_REPEATED_SHARE { SLOWER } else { FASTER };
         self.part = (self.part * change).clamp(SLOWEST, 1.0);
     }
 
@@ -101,7 +101,7 @@ impl Pacer {
 
     /// Forgets receivers to which nothing was sent recently.
     pub fn remove_expired(&mut self, now: Instant) {
-        self.buckets.retain(|_, bucket| now.saturating_duration_since(bucket.counted) < FORGOTTEN);
+        self.buckets.retain(|_, bucket| now.saturating_duration_since(bucket.counted) < RECEIVER_EXPIRY);
     }
 }
 
@@ -169,7 +169,7 @@ mod tests {
     fn receivers_are_forgotten() {
         let (mut pace, now) = (Pacer::default(), Instant::now());
         let _ = pace.try_reserve(now, TO.into(), 100, false);
-        pace.remove_expired(now + FORGOTTEN);
+        pace.remove_expired(now + RECEIVER_EXPIRY);
         assert!(pace.buckets.is_empty());
     }
 }

@@ -52,7 +52,7 @@ pub struct EndpointMatches {
     pub confirmed: Vec<Guid>,
     /// Endpoints with incompatible QoS, with the mismatches.
     pub refused: Vec<(Arc<EndpointData>, Vec<Mismatch>)>,
-    /// Of a transient-local reader: how many samples each matched writer keeps for late readers.
+    /// Number of samples that each matched writer of a transient-local reader keeps for late readers.
     pub(crate) kept: Vec<(Guid, usize)>,
 }
 

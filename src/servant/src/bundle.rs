@@ -26,7 +26,7 @@ pub const INOTIFY_INSTANCES: u64 = 128;
 /// Limit of pseudoterminals per container; the host has some thousands in total.
 pub const TERMINALS: u64 = 64;
 
-const MASKED: [&str; 9] = [
+const MASKED_PATHS: [&str; 9] = [
     "/proc/acpi",
     "/proc/asound",
     "/proc/kcore",
@@ -71,7 +71,7 @@ pub fn config(spec: &ContainerSpec, staged: &StagedRoot, quotas: &Quotas) -> Res
         // empty path its cleanup would kill every process of its caller's cgroups, up to the host's.
         .cgroups_path(Path::new("/cloudroid-unused").join(&spec.id))
         .seccomp(seccomp::build_profile(spec.profile)?)
-        .masked_paths(MASKED.map(str::to_owned).to_vec())
+        .masked_paths(MASKED_PATHS.map(str::to_owned).to_vec())
         .readonly_paths(READ_ONLY.map(str::to_owned).to_vec())
         .build()?;
     // The builder's default asks for a device filter, which needs a cgroup. The container has no devices but those

@@ -221,7 +221,7 @@ pub struct EndedServant {
 /// Servants found from an earlier daemon: each is in one of the three lists.
 #[derive(Default)]
 pub struct AdoptedServants {
-    /// Servants that are running.
+    /// Servants that are running. Those that have not told their state yet are in state [`ContainerState::Creating`].
     pub running: Vec<Arc<dyn ServantHandle>>,
     /// Servants that have ended. Their remains are harmless until [`Engine::sweep`] removes them.
     pub ended: Vec<EndedServant>,
@@ -235,7 +235,7 @@ pub trait Engine: Send + Sync + 'static {
     /// Starts a servant; returns once its container runs and its nodes are started or starting.
     async fn start(&self, spec: Spec) -> Result<Arc<dyn ServantHandle>, crate::Error>;
     /// Finds the servants of an earlier daemon: running ones are adopted, the others reported. Robots wait for it, so
-    /// nothing is removed. Fails only if nothing can be examined.
+    /// nothing is removed, and none that does not answer is waited for long. Fails only if nothing can be examined.
     async fn adopt(&self) -> Result<AdoptedServants, crate::Error>;
     /// Removes the remains of servants that have ended, except for the logs to be kept; returns errors for what could
     /// not be removed or kept.

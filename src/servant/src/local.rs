@@ -24,9 +24,9 @@ use crate::spec::{Limits, Size, Spec};
 use crate::uids;
 
 mod connection;
+mod ended_logs;
 pub mod grants;
 mod handle;
-mod kept;
 mod pool;
 mod resources;
 mod start;
@@ -39,6 +39,8 @@ pub use resources::Resources;
 
 /// Number of ended servants whose remains are removed concurrently.
 const SWEEPS: usize = 16;
+/// Number of servants of an earlier daemon that are examined concurrently.
+const LOOKS: usize = 64;
 
 /// Default base of the servants' uid ranges: 1879048192, the first of the 4094 ranges that systemd's documentation of
 /// user ids lists as unused. Ranges for `/etc/subuid` grow from 100000, those of systemd-nspawn from 524288; a range
@@ -280,7 +282,7 @@ impl Engine for LocalEngine {
     async fn kept_logs(&self) -> Result<Vec<KeptLog>, Error> {
         let config = &self.shared.config;
         let (kept, servants) = (config.kept_logs_dir.clone(), config.home_servants_dir.clone());
-        let listed = privilege::spawn_blocking(move || kept::list_logs(&kept, &servants)).await;
+        let listed = privilege::spawn_blocking(move || ended_logs::list_logs(&kept, &servants)).await;
         listed.unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
     }
 
@@ -291,7 +293,7 @@ impl Engine for LocalEngine {
     async fn remove_kept_logs(&self, ids: Vec<String>) -> Vec<Error> {
         let kept = self.shared.config.kept_logs_dir.clone();
         let removed = privilege::spawn_blocking(move || {
-            ids.iter().filter_map(|id| kept::remove_log(&kept.join(id)).err()).collect()
+            ids.iter().filter_map(|id| ended_logs::remove_log(&kept.join(id)).err()).collect()
         });
         removed.await.unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
     }
@@ -309,15 +311,19 @@ enum FoundServant {
 }
 
 impl LocalEngine {
-    /// Examines all directories concurrently, since a shim that does not answer is waited for.
+    /// Examines directories concurrently, since a shim that does not answer is waited for.
     async fn adopt_all(&self) -> Result<AdoptedServants, Error> {
         let home = &self.shared.config.home_servants_dir;
         let entries = std::fs::read_dir(home).map_err(Error::file("read", home))?;
+        let turns = Arc::new(Semaphore::new(LOOKS));
         let mut looks = JoinSet::new();
         for entry in entries {
             let entry = entry.map_err(Error::file("read", home))?;
-            let engine = self.clone();
-            looks.spawn(async move { engine.inspect_directory(&entry).await });
+            let (engine, turns) = (self.clone(), Arc::clone(&turns));
+            looks.spawn(async move {
+                let _turn = turns.acquire().await;
+                engine.inspect_directory(&entry).await
+            });
         }
         let mut adopted = AdoptedServants::default();
         for found in looks.join_all().await {
@@ -357,7 +363,7 @@ impl LocalEngine {
             sweeps.spawn(async move {
                 let _turn = turns.acquire().await;
                 let keeping = match ended.keep {
-                    Some(about) => kept::keep_log(&kept, &directory, about).await.map(drop),
+                    Some(about) => ended_logs::keep_log(&kept, &directory, about).await.map(drop),
                     None => Ok(()),
                 };
                 [keeping, sweep::sweep(&ended.id, &directory).await]

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use serde::{Deserialize, Serialize};
 
 use crate::sys;
-pub use crate::sys::trim_heap;
+pub use crate::sys::{allocated_bytes, trim_heap};
 
 /// Identity of a process in a record: its pid alone may have been reused by the time the record is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -15,7 +15,7 @@ use crate::container::Profile;
 /// Calls allowed with any arguments. `io_setup` and its relatives are not among them, since their pending requests are
 /// limited for the whole host (`fs.aio-max-nr`), which one servant could exhaust. Programs that find no such call do
 /// without.
-const ALLOWED: &[&str] = &[
+const ALLOWED_CALLS: &[&str] = &[
     // files
     "access chdir chmod chown close close_range copy_file_range creat dup dup2 dup3 faccessat faccessat2 fadvise64 \
      fallocate fchdir fchmod fchmodat fchmodat2 fchown fchownat fcntl fdatasync fgetxattr flistxattr flock \
@@ -57,7 +57,7 @@ const ALLOWED: &[&str] = &[
 const BUILDS_TOO: &[&str] = &["mbind", "name_to_handle_at", "set_mempolicy"];
 
 /// Known calls that are refused with `EPERM`.
-const REFUSED: &[&str] = &[
+const REFUSED_CALLS: &[&str] = &[
     // namespaces and mounts
     "chroot fsconfig fsmount fsopen fspick mount mount_setattr move_mount open_tree pivot_root setns umount2 unshare",
     // other processes
@@ -76,7 +76,7 @@ const CLONE_NEW: u64 = 0x7E02_0000;
 const FAMILIES: [u64; 4] = [1, 2, 10, 16];
 
 /// Families of socket pairs: unix. For others the kernel would load modules on request.
-const PAIRED: [u64; 1] = [1];
+const PAIR_FAMILIES: [u64; 1] = [1];
 
 /// Execution domains: Linux, 32-bit address limit, no address randomisation, both, and the query of the current one.
 const PERSONALITIES: [u64; 5] = [0x0, 0x8, 0x2_0000, 0x2_0008, 0xffff_ffff];
@@ -90,16 +90,16 @@ fn split_names(groups: &[&'static str]) -> Vec<&'static str> {
 
 /// Returns the calls that are refused to all untrusted processes.
 pub(crate) fn refused_calls() -> impl Iterator<Item = &'static str> {
-    split_names(REFUSED).into_iter()
+    split_names(REFUSED_CALLS).into_iter()
 }
 
 /// Builds the seccomp profile of an OCI specification.
 pub fn build_profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
-    let mut allowed = split_names(ALLOWED);
+    let mut allowed = split_names(ALLOWED_CALLS);
     if profile != Profile::Servant {
         allowed.extend(BUILDS_TOO);
     }
-    let mut refused = split_names(REFUSED);
+    let mut refused = split_names(REFUSED_CALLS);
     refused.retain(|name| !allowed.contains(name));
     let mut rules = vec![
         rule(&allowed, LinuxSeccompAction::ScmpActAllow, None, vec![])?,
@@ -108,7 +108,9 @@ pub fn build_profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
         // Its flags are behind a pointer, which no filter can follow; glibc falls back to clone.
         rule(&["clone3"], LinuxSeccompAction::ScmpActErrno, Some(libc::ENOSYS), vec![])?,
     ];
-    for (name, values) in [("socket", FAMILIES.as_slice()), ("socketpair", &PAIRED), ("personality", &PERSONALITIES)] {
+    for (name, values) in
+        [("socket", FAMILIES.as_slice()), ("socketpair", &PAIR_FAMILIES), ("personality", &PERSONALITIES)]
+    {
         for value in values {
             rules.push(rule(
                 &[name],
@@ -168,13 +170,13 @@ mod tests {
 
     #[test]
     fn no_call_is_both_allowed_and_refused() {
-        for list in [ALLOWED, BUILDS_TOO, REFUSED] {
+        for list in [ALLOWED_CALLS, BUILDS_TOO, REFUSED_CALLS] {
             let list = split_names(list);
             let once: BTreeSet<_> = list.iter().collect();
             assert_eq!(once.len(), list.len(), "a name is listed twice");
         }
-        let refused = split_names(REFUSED);
-        assert!(split_names(ALLOWED).iter().all(|name| !refused.contains(name)));
+        let refused = split_names(REFUSED_CALLS);
+        assert!(split_names(ALLOWED_CALLS).iter().all(|name| !refused.contains(name)));
     }
 
     #[test]
@@ -182,7 +184,7 @@ mod tests {
         for kind in [Profile::Servant, Profile::Compile, Profile::Install] {
             let text = serde_json::to_string(&build_profile(kind).unwrap()).unwrap();
             for name in "unshare setns mount ptrace keyctl bpf io_uring_setup userfaultfd".split(' ') {
-                assert!(!split_names(ALLOWED).contains(&name) && !BUILDS_TOO.contains(&name), "{name}");
+                assert!(!split_names(ALLOWED_CALLS).contains(&name) && !BUILDS_TOO.contains(&name), "{name}");
                 assert!(text.contains(name), "{name} is refused by name");
             }
         }

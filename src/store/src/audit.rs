@@ -6,7 +6,7 @@ use rusqlite::{Connection, Row, params};
 use super::{Error, State, now};
 
 /// Maximum number of records; older ones are deleted first. The database refuses to delete newer ones.
-const KEPT: i64 = 1_000_000;
+const MAX_RECORDS: i64 = 1_000_000;
 
 /// An audit record to be written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -52,7 +52,7 @@ fn insert(connection: &Connection, new: &NewAuditRecord<'_>) -> rusqlite::Result
             |row| row.get(0),
         )?;
     if id % 1_000 == 0 {
-        connection.execute("DELETE FROM audit WHERE id <= ?1", [id - KEPT])?;
+        connection.execute("DELETE FROM audit WHERE id <= ?1", [id - MAX_RECORDS])?;
     }
     Ok(id)
 }

@@ -24,7 +24,7 @@ const AGAIN: Duration = Duration::from_millis(500);
 /// Maximum time that a queueable write waits for the connection while a longer statement uses it.
 const MOMENT: Duration = Duration::from_millis(100);
 /// Maximum length of the queue; the oldest writes are dropped first.
-const KEPT: usize = 10_000;
+const MAX_QUEUE: usize = 10_000;
 
 /// A write that can be deferred.
 #[derive(Debug, Clone)]
@@ -84,7 +84,7 @@ impl Backlog {
 
 impl PendingWrites {
     fn push(&mut self, write: Write) {
-        if self.writes.len() == KEPT {
+        if self.writes.len() == MAX_QUEUE {
             self.writes.pop_front();
             self.dropped += 1;
         }

@@ -7,7 +7,7 @@ use super::backlog::Write;
 use super::{Error, State, now};
 
 /// Maximum number of events; older ones are deleted first.
-const EVENTS_KEPT: i64 = 10_000;
+const MAX_EVENTS: i64 = 10_000;
 
 /// Objects that a new event is about.
 #[derive(Debug, Clone, Default)]
@@ -87,7 +87,7 @@ pub(super) fn insert(connection: &Connection, event: &Event) -> rusqlite::Result
             event.message
         ])?;
     if event.id % 100 == 0 {
-        connection.execute("DELETE FROM events WHERE id <= ?1", [event.id - EVENTS_KEPT])?;
+        connection.execute("DELETE FROM events WHERE id <= ?1", [event.id - MAX_EVENTS])?;
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use rusqlite::{Connection, params};
 use super::{Error, EventVisibility, State};
 
 /// Maximum number of servants with samples; those seen least recently are deleted first.
-const RECORDED: i64 = 20_000;
+const MAX_SERVANTS: i64 = 20_000;
 /// Maximum number of local periods; older ones are deleted first.
 const PERIODS: i64 = 10_000;
 
@@ -98,7 +98,7 @@ impl State {
             transaction.execute("DELETE FROM recorded WHERE seen < ?1", [oldest])?;
             transaction.execute(
                 "DELETE FROM recorded WHERE id IN (SELECT id FROM recorded ORDER BY seen DESC LIMIT -1 OFFSET ?1)",
-                [RECORDED],
+                [MAX_SERVANTS],
             )?;
             transaction.execute("DELETE FROM local_periods WHERE ended < ?1", [oldest])?;
             transaction

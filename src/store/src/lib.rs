@@ -231,13 +231,13 @@ fn commit<T>(
 }
 
 /// Time for which the database may be locked by others before a statement fails.
-const LOCKED: Duration = Duration::from_secs(5);
+const LOCK_TIMEOUT: Duration = Duration::from_secs(5);
 /// Interval between attempts.
 const RETRY: Duration = Duration::from_millis(10);
 
 /// Busy handler: returns whether SQLite should wait for the lock again after `attempts` attempts.
 fn wait_for_another(attempts: i32) -> bool {
-    if RETRY * attempts.unsigned_abs() >= LOCKED {
+    if RETRY * attempts.unsigned_abs() >= LOCK_TIMEOUT {
         return false;
     }
     run_blocking(|| std::thread::sleep(RETRY));

@@ -39,7 +39,9 @@ impl Readers {
 fn open_connection(path: &Path) -> rusqlite::Result<Connection> {
     let mut connection = Connection::open(path)?;
     connection.busy_handler(Some(wait_for_another))?;
-    connection.execute_batch("PRAGMA query_only = ON; PRAGMA temp_store = MEMORY;")?;
+    // The kernel caches the file for all connections. Caches of SQLite's own size, 2 MB each, would be filled within
+    // hours by old pages that nobody reads again.
+    connection.execute_batch("PRAGMA query_only = ON; PRAGMA temp_store = MEMORY; PRAGMA cache_size = -256;")?;
     open_files(&connection)?;
     Ok(connection)
 }

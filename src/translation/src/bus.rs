@@ -8,7 +8,7 @@
 //! What has no twin is left out of the graph, and [`TranslatedBus::left_out`] says why. A message that cannot be
 //! carried is dropped and counted; the [`TranslationObserver`] is told of the first one of each topic. A service that
 //! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response. Of an action only
-//! goals, feedback and results are carried, and its topics or services are made anew.
+//! goals, feedback and results are carried, and its topics or services are made anew, whichever side serves it.
 
 mod actions;
 mod graph;
@@ -25,7 +25,7 @@ mod tests;
 mod topics;
 mod twins;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -34,9 +34,9 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, Lending, LentService,
-    NodeParameters, Offer, ParameterKind, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler,
-    ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, Lender, Lending,
+    LentService, NodeParameters, Offer, ParameterKind, PeerId, Publisher, PublisherReports, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::schema::{ActionDef, MessageType, Registry, ServiceDef};
 use tokio::sync::watch;
@@ -49,7 +49,7 @@ use actions::ActionEnds;
 use lending::TranslatedLending;
 use losses::LossCounters;
 pub use losses::{TranslationLosses, TranslationObserver};
-use parameters::{ParameterServices, TranslatedLaunch, TranslatedParameters};
+use parameters::{TranslatedLaunch, TranslatedParameters};
 use state::Translation;
 use state::not_translated;
 pub use state::{LeftOut, LeftOutEntry};
@@ -68,8 +68,8 @@ pub struct TranslatedBus {
 
 impl TranslatedBus {
     /// Creates the bus that robots of the other ROS see in place of `inner`. `registry` has the definitions of the
-    /// servant's image; goals under way, results and parameters that are kept for robots are charged to `budget`. Call
-    /// it within a Tokio runtime.
+    /// servant's image; goals under way, results and parameters that are kept for robots are charged to `budget`,
+    /// as is the processor time for following the graph. Call it within a Tokio runtime.
     pub fn new(
         inner: Arc<dyn Bus>,
         types: Arc<TypeTranslations>,
@@ -89,7 +89,7 @@ impl TranslatedBus {
         let (graph, left_out) = (watch::Sender::default(), watch::Sender::default());
         let (graphs, omissions) = (graph.subscribe(), left_out.subscribe());
         let following = graph::follow(Arc::clone(&translation), graph, left_out);
-        let following = AbortOnDropHandle::new(tokio::spawn(following.in_current_span()));
+        let following = AbortOnDropHandle::new(tokio::spawn(budget.meter(following).in_current_span()));
         let actions = ActionEnds::new(&translation, budget);
         let lending = TranslatedLending(Arc::clone(&translation));
         Arc::new(Self { translation, graph: graphs, left_out: omissions, actions, lending, _following: following })
@@ -107,9 +107,10 @@ impl TranslatedBus {
 
     /// Returns the definition of a message type that the robot sees, by name and digest (which may be `*`).
     pub fn message(&self, of: &WireType) -> Option<Arc<MessageType>> {
-        match self.translation.twins.message_with_twin(of) {
+        let (twins, parameters) = (&self.translation.twins, &self.translation.parameters);
+        match twins.message_with_twin(of) {
             Some(twin) => Some(Arc::clone(&twin.twin)),
-            None => self.translation.twins.message_of_action(of),
+            None => twins.message_of_action(of).or_else(|| parameters.find_message(of)),
         }
     }
 
@@ -152,9 +153,28 @@ impl TranslatedBus {
         self.translation.parameters.prepare_launch(node, argv, kinds)
     }
 
+    /// Lets nodes of the servant use the actions of a robot of ROS 2, whose services `lender` finds in the terms of
+    /// that ROS. Those of a robot of ROS 1 consist of topics.
+    pub fn lend_actions(&self, lender: Arc<dyn Lender>) {
+        self.actions.lent_actions().set_lender(lender);
+    }
+
     /// Returns a service of the robot as the servant's nodes see it.
     pub fn lend_to_servant(&self, service: &str, lent: LentService) -> Result<LentService, BusError> {
         lending::lend_to_servant(&self.translation, service, lent)
+    }
+}
+
+/// Reports of nodes of ROS 1; those of ROS 2 need none.
+#[async_trait]
+impl PublisherReports for TranslatedBus {
+    async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
+        let is_made_here =
+            self.actions.find_topic(topic)?.is_some() || self.translation.parameters.find_topic(topic).is_some();
+        match self.translation.inner.publisher_reports() {
+            Some(reports) if !is_made_here => reports.reported_connections(topic).await,
+            _ => Err(BusError::NotOffered("reports about topics that no node of the servant publishes")),
+        }
     }
 }
 
@@ -177,13 +197,23 @@ impl Bus for TranslatedBus {
     }
 
     async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
-        match self.actions.find_topic(topic)? {
-            Some((end, action)) => action.subscribe((end, topic), &of, qos),
+        if let Some((end, action)) = self.actions.lent_actions().find_topic(topic, true) {
+            return action.subscribe(end, &of, qos);
+        }
+        if let Some((end, action)) = self.actions.find_topic(topic)? {
+            return action.subscribe((end, topic), &of, qos);
+        }
+        let parameters = &self.translation.parameters;
+        match parameters.find_topic(topic) {
+            Some(topic) => parameters.subscribe(topic, &of, qos),
             None => topics::subscribe(&self.translation, topic, of, qos).await,
         }
     }
 
     async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
+        if let Some((end, action)) = self.actions.lent_actions().find_topic(topic, false) {
+            return action.advertise(end, &of);
+        }
         match self.actions.find_topic(topic)? {
             Some((end, action)) => action.advertise((end, topic), &of),
             None => topics::advertise(&self.translation, topic, &of, qos).await,
@@ -200,9 +230,16 @@ impl Bus for TranslatedBus {
         if let Some((end, action)) = self.actions.find_service(service)? {
             return action.call((end, service), digest, request, timeout).await;
         }
-        if self.translation.find_parameter_service(service).is_some() {
-            let parameters = self.translation.parameters.of_nodes()?;
-            let answer = tokio::time::timeout(timeout, ParameterServices::call(parameters, service, &request)).await;
+        let parameters = &self.translation.parameters;
+        if let Some(of) = parameters.find_service_type(service) {
+            let ours = of?;
+            if !ours.digest.is_compatible_with(digest) {
+                let theirs = format!("{} {}", ours.name, ours.digest);
+                let what = format!("service {service}");
+                return Err(BusError::TypeMismatch { what, theirs, ours: digest.to_string() });
+            }
+            let report = |text: &str| self.translation.losses.report_refusal(service, text);
+            let answer = tokio::time::timeout(timeout, parameters.call(service, &request, &report)).await;
             return answer
                 .unwrap_or_else(|_| Err(BusError::Timeout { what: format!("service {service}"), after: timeout }));
         }
@@ -213,7 +250,7 @@ impl Bus for TranslatedBus {
         if let Some((end, action)) = self.actions.find_service(service)? {
             return action.service_type(end, service);
         }
-        if let Some(of) = self.translation.find_parameter_service(service) {
+        if let Some(of) = self.translation.parameters.find_service_type(service) {
             return of;
         }
         let of = self.translation.inner.service_type(service).await?;
@@ -230,6 +267,9 @@ impl Bus for TranslatedBus {
     async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
         if let Some((end, action)) = self.actions.find_topic(topic)? {
             return action.offer(end, topic);
+        }
+        if let Some(topic) = self.translation.parameters.find_topic(topic) {
+            return topic.offer();
         }
         let Offer { wire_type, latching, kept } = self.translation.inner.topic_offer(topic).await?;
         let twin = self.translation.twins.message(&wire_type);
@@ -273,8 +313,7 @@ impl Bus for TranslatedBus {
     }
 
     fn publisher_reports(&self) -> Option<&dyn PublisherReports> {
-        // Its answers name nodes, and ROS 2 has none.
-        self.translation.inner.publisher_reports()
+        self.translation.inner.publisher_reports().map(|_| self as _)
     }
 
     fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {

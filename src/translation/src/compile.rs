@@ -227,7 +227,7 @@ impl<'a> Compiler<'a> {
                         let is_byte = [source, target].iter().any(|slot| slot.type_name == "byte");
                         let same = from == to || (is_byte && from.width() == to.width());
                         // Nodes of ROS 2 refuse a bool that is neither 0 nor 1.
-                        let is_loose = from == Number::Bool && self.from == RosVersion::One;
+                        let is_loose = from == Number::BOOL && self.from == RosVersion::One;
                         if same && !is_loose {
                             Action::Copy { width: from.width(), bytes: from.width() }
                         } else {

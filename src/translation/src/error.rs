@@ -7,6 +7,9 @@ use ros_message::schema::SchemaError;
 /// An error of a message that cannot be carried to the other ROS; it names the field.
 pub type TranslationError = CodecError;
 
+/// Maximum difference between the smallest messages of two twins, in bytes.
+pub(crate) const MAX_DIFFERENCE: usize = 1 << 20;
+
 /// A type that has no twin in the other ROS.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{name} of ROS {} has no counterpart in ROS {}: {reason}", .version.number(), .version.other().number())]
@@ -85,6 +88,22 @@ pub enum NoTwinReason {
         first: String,
         /// Another one.
         second: String,
+    },
+    /// A message with nothing in it takes far more bytes on one side: whoever sends a few bytes would have as many
+    /// written for each.
+    #[error(
+        "an empty {one} has {one_bytes} bytes in ROS 1, an empty {two} {two_bytes} bytes in ROS 2, and they may differ \
+         by {MAX_DIFFERENCE}; shorten the arrays of fixed length in it"
+    )]
+    EmptySize {
+        /// Name of the message in ROS 1.
+        one: String,
+        /// Size of the smallest message in ROS 1.
+        one_bytes: usize,
+        /// Name of the message in ROS 2.
+        two: String,
+        /// Size of the smallest message in ROS 2.
+        two_bytes: usize,
     },
     /// The definition of the twin is not valid.
     #[error("{0}")]

@@ -11,8 +11,8 @@
 //!
 //! What the other ROS cannot hold is treated by rule. Lengths beyond a bound of ROS 2 are refused. Numbers out of range
 //! and times before 1970 (ROS 1 has none) or after 2038 (ROS 2 has none) become the nearest ones, and what is no
-//! Unicode becomes U+FFFD; [`MessageTranslator::saturated`] counts them. `Header.seq` is left out towards ROS 2 and 0
-//! towards ROS 1.
+//! Unicode becomes U+FFFD; [`MessageTranslator::saturated_count`] counts them. `Header.seq` is left out towards ROS 2
+//! and 0 towards ROS 1.
 
 #![forbid(unsafe_code)]
 
@@ -20,7 +20,6 @@ pub mod bus;
 mod compile;
 mod derive;
 mod error;
-mod fault;
 mod names;
 mod number;
 mod output;

@@ -2,71 +2,44 @@
 
 use ros_message::schema::Primitive;
 
-/// Types of numbers.
+/// A built-in type that is a number or a bool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Number {
-    Bool,
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    I64,
-    U64,
-    F32,
-    F64,
-}
+pub(crate) struct Number(Primitive);
 
 impl Number {
+    pub(crate) const BOOL: Number = Number(Primitive::Bool);
+
     pub(crate) fn from_primitive(primitive: Primitive) -> Option<Number> {
-        Some(match primitive {
-            Primitive::Bool => Number::Bool,
-            Primitive::Int8 => Number::I8,
-            Primitive::Uint8 => Number::U8,
-            Primitive::Int16 => Number::I16,
-            Primitive::Uint16 => Number::U16,
-            Primitive::Int32 => Number::I32,
-            Primitive::Uint32 => Number::U32,
-            Primitive::Int64 => Number::I64,
-            Primitive::Uint64 => Number::U64,
-            Primitive::Float32 => Number::F32,
-            Primitive::Float64 => Number::F64,
-            Primitive::String | Primitive::Wstring | Primitive::Time | Primitive::Duration => return None,
-        })
+        let is_other =
+            matches!(primitive, Primitive::String | Primitive::Wstring | Primitive::Time | Primitive::Duration);
+        (!is_other).then_some(Number(primitive))
     }
 
     pub(crate) fn width(self) -> usize {
-        match self {
-            Number::Bool | Number::I8 | Number::U8 => 1,
-            Number::I16 | Number::U16 => 2,
-            Number::I32 | Number::U32 | Number::F32 => 4,
-            Number::I64 | Number::U64 | Number::F64 => 8,
-        }
+        self.0.size()
     }
 
     fn is_float(self) -> bool {
-        matches!(self, Number::F32 | Number::F64)
+        matches!(self.0, Primitive::Float32 | Primitive::Float64)
     }
 
     /// Returns true if numbers of one type are converted into the other: integers into integers, floats into floats.
     pub(crate) fn is_convertible_to(self, other: Number) -> bool {
-        let is_bool = |number| number == Number::Bool;
-        is_bool(self) == is_bool(other) && self.is_float() == other.is_float()
+        (self == Number::BOOL) == (other == Number::BOOL) && self.is_float() == other.is_float()
     }
 
     /// Returns the smallest and the largest integer.
     fn range(self) -> (i128, i128) {
-        match self {
-            Number::Bool => (0, 1),
-            Number::I8 => (i8::MIN.into(), i8::MAX.into()),
-            Number::U8 => (0, u8::MAX.into()),
-            Number::I16 => (i16::MIN.into(), i16::MAX.into()),
-            Number::U16 => (0, u16::MAX.into()),
-            Number::I32 => (i32::MIN.into(), i32::MAX.into()),
-            Number::U32 => (0, u32::MAX.into()),
-            Number::I64 => (i64::MIN.into(), i64::MAX.into()),
-            Number::U64 | Number::F32 | Number::F64 => (0, u64::MAX.into()),
+        match self.0 {
+            Primitive::Bool => (0, 1),
+            Primitive::Int8 => (i8::MIN.into(), i8::MAX.into()),
+            Primitive::Int16 => (i16::MIN.into(), i16::MAX.into()),
+            Primitive::Int32 => (i32::MIN.into(), i32::MAX.into()),
+            Primitive::Int64 => (i64::MIN.into(), i64::MAX.into()),
+            Primitive::Uint8 => (0, u8::MAX.into()),
+            Primitive::Uint16 => (0, u16::MAX.into()),
+            Primitive::Uint32 => (0, u32::MAX.into()),
+            _ => (0, u64::MAX.into()),
         }
     }
 }
@@ -74,7 +47,7 @@ impl Number {
 /// Converts a number, given and returned as little-endian bytes of which only the type's width counts. Returns true
 /// beside it if the number did not fit and the nearest one stands in its place. Any byte but 0 is a true bool.
 pub(crate) fn convert(from: Number, to: Number, bytes: [u8; 8]) -> ([u8; 8], bool) {
-    if from == Number::Bool {
+    if from == Number::BOOL {
         return ([u8::from(bytes[0] != 0), 0, 0, 0, 0, 0, 0, 0], false);
     }
     if from.is_float() {
@@ -93,8 +66,8 @@ pub(crate) fn convert(from: Number, to: Number, bytes: [u8; 8]) -> ([u8; 8], boo
 fn convert_float(from: Number, to: Number, bytes: [u8; 8]) -> ([u8; 8], bool) {
     let [a, b, c, d, ..] = bytes;
     let single = f32::from_le_bytes([a, b, c, d]);
-    let double = if from == Number::F32 { single.into() } else { f64::from_le_bytes(bytes) };
-    if to == Number::F64 {
+    let double = if from.0 == Primitive::Float32 { single.into() } else { f64::from_le_bytes(bytes) };
+    if to.0 == Primitive::Float64 {
         return (double.to_le_bytes(), false);
     }
     let rounded = double as f32;
@@ -119,23 +92,24 @@ mod tests {
     #[test]
     fn integers_out_of_range_become_the_nearest() {
         for (from, to, value, expected) in [
-            (Number::I8, Number::U8, -1, (0, true)),
-            (Number::U8, Number::I8, 200, (127, true)),
-            (Number::I32, Number::I16, -70_000, (-32_768, true)),
-            (Number::I16, Number::I64, -5, (-5, false)),
-            (Number::U32, Number::I32, 7, (7, false)),
-            (Number::U64, Number::I64, -1, (i64::MAX, true)),
-            (Number::I64, Number::U32, 1 << 40, (u32::MAX.into(), true)),
+            (Number(Primitive::Int8), Number(Primitive::Uint8), -1, (0, true)),
+            (Number(Primitive::Uint8), Number(Primitive::Int8), 200, (127, true)),
+            (Number(Primitive::Int32), Number(Primitive::Int16), -70_000, (-32_768, true)),
+            (Number(Primitive::Int16), Number(Primitive::Int64), -5, (-5, false)),
+            (Number(Primitive::Uint32), Number(Primitive::Int32), 7, (7, false)),
+            (Number(Primitive::Uint64), Number(Primitive::Int64), -1, (i64::MAX, true)),
+            (Number(Primitive::Int64), Number(Primitive::Uint32), 1 << 40, (u32::MAX.into(), true)),
         ] {
             assert_eq!(integer(from, to, value), expected, "{from:?} {to:?} {value}");
         }
-        assert_eq!(convert(Number::Bool, Number::Bool, [7; 8]).0[0], 1);
+        assert_eq!(convert(Number::BOOL, Number::BOOL, [7; 8]).0[0], 1);
     }
 
     #[test]
     fn floats_are_rounded_and_stay_finite() {
         let narrow = |value: f64| {
-            let (bytes, saturated) = convert(Number::F64, Number::F32, value.to_le_bytes());
+            let (bytes, saturated) =
+                convert(Number(Primitive::Float64), Number(Primitive::Float32), value.to_le_bytes());
             let [a, b, c, d, ..] = bytes;
             (f32::from_le_bytes([a, b, c, d]), saturated)
         };
@@ -145,7 +119,13 @@ mod tests {
         assert!(narrow(f64::NAN).0.is_nan());
         let mut single = [0; 8];
         single[..4].copy_from_slice(&0.5f32.to_le_bytes());
-        assert_eq!(convert(Number::F32, Number::F64, single), (0.5f64.to_le_bytes(), false));
-        assert!(!Number::I32.is_convertible_to(Number::F32) && !Number::Bool.is_convertible_to(Number::U8));
+        assert_eq!(
+            convert(Number(Primitive::Float32), Number(Primitive::Float64), single),
+            (0.5f64.to_le_bytes(), false)
+        );
+        assert!(
+            !Number(Primitive::Int32).is_convertible_to(Number(Primitive::Float32))
+                && !Number::BOOL.is_convertible_to(Number(Primitive::Uint8))
+        );
     }
 }

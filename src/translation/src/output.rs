@@ -1,9 +1,7 @@
 //! The message being written.
 
 use ros_message::RosVersion;
-use ros_message::codec::{CodecErrorKind, DEFAULT_MAX_BYTES};
-
-use crate::fault::Fault;
+use ros_message::codec::{CodecErrorKind, DEFAULT_MAX_BYTES, Fault};
 
 /// Header of ROS 2's serialization: plain CDR, little endian (OMG DDS-XTypes 1.3, section 7.6.3.1.2).
 const HEADER: [u8; 4] = [0, 1, 0, 0];

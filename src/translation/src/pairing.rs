@@ -58,10 +58,10 @@ impl Pairings {
                 NoTwinReason::FieldType(Box::new(UnlikeFields {
                     one: one.name().to_owned(),
                     one_field: write_path(one, &pair.one),
-                    one_type: one_slot.written(),
+                    one_type: one_slot.definition_text(),
                     two: two.name().to_owned(),
                     two_field: write_path(two, &pair.two),
-                    two_type: two_slot.written(),
+                    two_type: two_slot.definition_text(),
                 }))
             };
             match relate(&one_slot, &two_slot).ok_or_else(unlike)? {

@@ -7,10 +7,9 @@
 use std::sync::Arc;
 
 use ros_message::RosVersion;
-use ros_message::codec::CodecErrorKind;
 use ros_message::codec::cursor::MessageCursor;
+use ros_message::codec::{CodecErrorKind, Fault};
 
-use crate::fault::Fault;
 use crate::number::{Number, convert};
 use crate::output::Output;
 use crate::shape::{Count, Shape, take, take_count, take_text};
@@ -42,7 +41,7 @@ pub(crate) struct Step {
     pub(crate) action: Action,
 }
 
-/// What a step does.
+/// Operation of a step.
 #[derive(Debug, Clone)]
 pub(crate) enum Action {
     /// Copies numbers of one width.

@@ -4,11 +4,9 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use ros_message::RosVersion;
-use ros_message::codec::CodecErrorKind;
 use ros_message::codec::cursor::MessageCursor;
+use ros_message::codec::{CodecErrorKind, Fault};
 use ros_message::schema::{Arity, Base, Field, FieldBounds, MessageType, Primitive};
-
-use crate::fault::Fault;
 
 /// Maximum length of an array whose elements have no bytes: such elements cost nothing on the wire.
 const MAX_EMPTY_ELEMENTS: usize = 1 << 16;
@@ -99,7 +97,7 @@ impl<'a> Slot<'a> {
     }
 
     /// Returns the type as a definition writes it.
-    pub(crate) fn written(&self) -> String {
+    pub(crate) fn definition_text(&self) -> String {
         let bound = self.bounds.text.map(|most| format!("<={most}")).unwrap_or_default();
         let brackets = match (self.arity, self.bounds.elements) {
             (Arity::One, _) => String::new(),
@@ -250,7 +248,7 @@ impl Shape {
 pub(crate) fn take<'a>(cursor: &mut MessageCursor<'a>, size: usize, alignment: usize) -> Result<&'a [u8], Fault> {
     match cursor.take(size, alignment) {
         Some(taken) => Ok(taken),
-        None => Err(truncated(cursor, size)),
+        None => Err(truncation_fault(cursor, size)),
     }
 }
 
@@ -258,7 +256,7 @@ pub(crate) fn take<'a>(cursor: &mut MessageCursor<'a>, size: usize, alignment: u
 #[inline]
 pub(crate) fn take_text<'a>(cursor: &mut MessageCursor<'a>, wide: bool) -> Result<(u32, &'a [u8]), Fault> {
     let Some(length) = cursor.number().map(u32::from_le_bytes) else {
-        return Err(truncated(cursor, 4));
+        return Err(truncation_fault(cursor, 4));
     };
     let unit = if wide { 4 } else { 1 };
     let size = (length as usize).saturating_mul(unit);
@@ -275,7 +273,7 @@ pub(crate) fn take_count(cursor: &mut MessageCursor<'_>, count: Count, min_size:
         Count::Fixed(length) => length,
         Count::Variable { .. } => match cursor.length() {
             Some(length) => length,
-            None => return Err(truncated(cursor, 4)),
+            None => return Err(truncation_fault(cursor, 4)),
         },
     };
     let fits = match min_size {
@@ -289,7 +287,7 @@ pub(crate) fn take_count(cursor: &mut MessageCursor<'_>, count: Count, min_size:
 }
 
 #[cold]
-fn truncated(cursor: &MessageCursor<'_>, size: usize) -> Fault {
+fn truncation_fault(cursor: &MessageCursor<'_>, size: usize) -> Fault {
     // Padding may be missing too.
     let missing = size.saturating_sub(cursor.remaining()).max(1);
     CodecErrorKind::Truncated { missing }.into()

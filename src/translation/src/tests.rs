@@ -77,6 +77,6 @@ pub(crate) fn carry(pair: &MessageTwin, given: &str) -> serde_json::Value {
 
 /// Returns types and names of fields.
 pub(crate) fn fields(message: &MessageType) -> Vec<String> {
-    let written = |field: &Field| format!("{} {}", Slot::from_field(field).written(), field.name);
+    let written = |field: &Field| format!("{} {}", Slot::from_field(field).definition_text(), field.name);
     message.fields().iter().map(written).collect()
 }

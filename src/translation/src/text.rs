@@ -1,8 +1,6 @@
 //! Texts: bytes in ROS 1, bytes with a NUL at their end or UTF-16 units of four bytes each in ROS 2.
 
-use ros_message::codec::CodecErrorKind;
-
-use crate::fault::Fault;
+use ros_message::codec::{CodecErrorKind, Fault};
 
 /// Serialized forms of texts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

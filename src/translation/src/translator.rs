@@ -5,12 +5,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use ros_message::RosVersion;
-use ros_message::codec::CodecErrorKind;
 use ros_message::codec::cursor::MessageCursor;
+use ros_message::codec::{CodecErrorKind, Fault};
 use ros_message::schema::MessageType;
 
 use crate::TranslationError;
-use crate::fault::Fault;
 use crate::output::Output;
 use crate::program::{Program, Run};
 
@@ -58,7 +57,7 @@ impl MessageTranslator {
 
     /// Returns the number of values so far that the twin could not hold and in whose place the nearest ones were
     /// written: times before 1970 or after 2038, numbers out of range, characters that are not Unicode.
-    pub fn saturated(&self) -> u64 {
+    pub fn saturated_count(&self) -> u64 {
         self.saturated.load(Ordering::Relaxed)
     }
 

@@ -9,7 +9,7 @@ use ros_message::schema::{ActionDef, MessageType, Registry, SchemaError, Service
 
 use crate::compile::Compiler;
 use crate::derive::Derivation;
-use crate::error::{NoTwin, NoTwinReason};
+use crate::error::{MAX_DIFFERENCE, NoTwin, NoTwinReason};
 use crate::pairing::Pairings;
 use crate::rules::TranslationRules;
 use crate::translator::MessageTranslator;
@@ -229,7 +229,7 @@ impl TypeTranslations {
     /// Returns `name`, or, if only that is known, the name in a package whose name ends in `_interfaces` instead of
     /// `_msgs`, as packages of ROS 2 are called: ros1_bridge pairs these without a rule.
     fn choose_name(&self, name: String, from: RosVersion, is_known: impl Fn(&Registry, &str) -> bool) -> String {
-        let Some(known) = self.known(from.other()) else {
+        let Some(known) = self.known_registry(from.other()) else {
             return name;
         };
         let (package, rest) = name.split_once('/').unwrap_or((&name, ""));
@@ -251,7 +251,7 @@ impl TypeTranslations {
         (kept.found.len(), kept.bytes)
     }
 
-    fn known(&self, version: RosVersion) -> Option<&Registry> {
+    fn known_registry(&self, version: RosVersion) -> Option<&Registry> {
         match version {
             RosVersion::One => self.known_one.as_deref(),
             RosVersion::Two => self.known_two.as_deref(),
@@ -265,7 +265,7 @@ impl TypeTranslations {
             Some(known) => known,
             None => {
                 let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
+                let mut derivation = Derivation::new(&self.rules, self.known_registry(to), to, &name_of);
                 derivation.add_message(of, &name)?;
                 derivation.resolve(|registry| registry.message(&name))?
             }
@@ -283,7 +283,7 @@ impl TypeTranslations {
                 let parts = [(&*of.request, "Request"), (&*of.response, "Response")];
                 let parts = parts.map(|(part, suffix)| (part, part_name(&name, to, suffix)));
                 let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
+                let mut derivation = Derivation::new(&self.rules, self.known_registry(to), to, &name_of);
                 derivation.add_parts(&key_of(&name, "srv"), &parts)?;
                 derivation.resolve(|registry| registry.service(&name))?
             }
@@ -310,7 +310,7 @@ impl TypeTranslations {
                 let parts = [(&*of.goal, "Goal"), (&*of.result, "Result"), (&*of.feedback, "Feedback")];
                 let parts = parts.map(|(part, suffix)| (part, part_name(&name, to, suffix)));
                 let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
+                let mut derivation = Derivation::new(&self.rules, self.known_registry(to), to, &name_of);
                 derivation.add_parts(&key_of(&name, "action"), &parts)?;
                 derivation.resolve(|registry| registry.action(&name))?
             }
@@ -330,7 +330,7 @@ impl TypeTranslations {
         version: RosVersion,
         find: impl Fn(&Registry) -> Result<T, SchemaError>,
     ) -> Result<Option<T>, NoTwinReason> {
-        match self.known(version).map(find) {
+        match self.known_registry(version).map(find) {
             None | Some(Err(SchemaError::Unknown(_))) => Ok(None),
             Some(Ok(known)) => Ok(Some(known)),
             Some(Err(error)) => Err(NoTwinReason::Definition(error)),
@@ -339,11 +339,20 @@ impl TypeTranslations {
 
     /// Pairs the fields of two messages and compiles the translators of both ways.
     fn pair(&self, original: &Arc<MessageType>, twin: &Arc<MessageType>) -> Result<MessageTwin, NoTwinReason> {
-        let mut pairings = Pairings::default();
-        match original.version() {
-            RosVersion::One => pairings.add(&self.rules, original, twin)?,
-            RosVersion::Two => pairings.add(&self.rules, twin, original)?,
+        let (one, two) = match original.version() {
+            RosVersion::One => (original, twin),
+            RosVersion::Two => (twin, original),
+        };
+        if one.min_size().abs_diff(two.min_size()) > MAX_DIFFERENCE {
+            return Err(NoTwinReason::EmptySize {
+                one: one.name().to_owned(),
+                one_bytes: one.min_size(),
+                two: two.name().to_owned(),
+                two_bytes: two.min_size(),
+            });
         }
+        let mut pairings = Pairings::default();
+        pairings.add(&self.rules, one, two)?;
         let translator = |source: &Arc<MessageType>, target: &Arc<MessageType>| {
             let mut compiler = Compiler::new(&pairings, source.version());
             let program = compiler.message(source, target);

@@ -8,7 +8,7 @@ use ros::bus::{Graph, WireType};
 use ros::schema::ServiceDef;
 
 /// Limit on the topics, and on the services, advertised to one viewer.
-const MOST: usize = 2_000;
+const MAX_ADVERTISED: usize = 2_000;
 
 /// Topics and services advertised to one viewer.
 #[derive(Default)]
@@ -62,13 +62,13 @@ impl Catalogue {
         let called: BTreeSet<&String> = self.services.values().map(|(name, _)| name).collect();
         for (name, topic) in &graph.topics {
             let is_new = !known.contains(name) && !self.asked.contains(name);
-            if is_new && published(name) && may(name) && known.len() < MOST {
+            if is_new && published(name) && may(name) && known.len() < MAX_ADVERTISED {
                 changes.topics.push((name.clone(), topic.type_name.clone()));
             }
         }
         for name in graph.services.keys() {
             let is_new = !called.contains(name) && !self.asked.contains(name);
-            if is_new && served(name) && called.len() < MOST {
+            if is_new && served(name) && called.len() < MAX_ADVERTISED {
                 changes.services.push(name.clone());
             }
         }

@@ -53,8 +53,8 @@ const CONNECTS: Duration = Duration::from_secs(2);
 /// Maximum size of a message from a viewer in bytes.
 const LARGEST: usize = 16 << 20;
 /// Close codes (RFC 6455): the servant has ended; the permission was revoked.
-const ENDED: u16 = 1012;
-const NOT_ALLOWED: u16 = 1008;
+const CLOSE_ENDED: u16 = 1012;
+const CLOSE_NOT_ALLOWED: u16 = 1008;
 
 /// Options of a viewer's session.
 pub struct ViewerOptions {
@@ -136,10 +136,10 @@ pub async fn serve<S>(
                 }
             },
             Some(frame) = outgoing.recv(), if is_given => line.send(frame),
-            reason = wait_for_end(&mut ended) => break ViewerSessionEnd::Close(ENDED, reason, true),
+            reason = wait_for_end(&mut ended) => break ViewerSessionEnd::Close(CLOSE_ENDED, reason, true),
             changed = graph.changed() => {
                 if changed.is_err() {
-                    break ViewerSessionEnd::Close(ENDED, "the servant has ended".to_owned(), true);
+                    break ViewerSessionEnd::Close(CLOSE_ENDED, "the servant has ended".to_owned(), true);
                 }
                 let now = Arc::clone(&graph.borrow_and_update());
                 session.update_catalogue(&now);
@@ -148,7 +148,7 @@ pub async fn serve<S>(
             Some(ended) = session.tasks.join_next() => session.on_task_finished(&ended),
             () = session.granted.wait_changed() => {
                 if let Some(reason) = session.granted.end_reason() {
-                    break ViewerSessionEnd::Close(NOT_ALLOWED, reason, true);
+                    break ViewerSessionEnd::Close(CLOSE_NOT_ALLOWED, reason, true);
                 }
                 let now = Arc::clone(&graph.borrow_and_update());
                 session.drop_revoked();

@@ -21,7 +21,7 @@ use crate::memory_bus::MemorySystem;
 use crate::{ViewedServant, ViewerOptions, serve};
 
 /// Only limits how long a failing test takes.
-const LONG: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Client end of a WebSocket, without the upgrade.
 struct Viewer(DuplexStream);
@@ -63,7 +63,7 @@ impl Viewer {
                 }
             }
         };
-        timeout(LONG, told).await.expect("it is told")
+        timeout(PATIENCE, told).await.expect("it is told")
     }
 }
 
@@ -75,9 +75,9 @@ fn open_viewer(system: &Arc<MemorySystem>, registry: Arc<Registry>, budget: &Bud
     let servant = ViewedServant { bus, registry, ended, held: Box::new(ends) };
     let options = ViewerOptions {
         name: "lab".to_owned(),
-        granted: ClientGrants::fixed(access::Grants::everything()),
+        granted: ClientGrants::from_fixed(access::Grants::everything()),
         budget: budget.clone(),
-        unfinished: LONG,
+        unfinished: PATIENCE,
         depth: 2,
     };
     let serving = serve(ours, Bytes::new(), async { Ok(servant) }, options);
@@ -90,26 +90,39 @@ struct Pictures;
 #[async_trait]
 impl ServiceHandler for Pictures {
     async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
-        let length = 1_u32 << 20;
+        let length = PICTURE as u32;
         let head = [&[0, 1, 0, 0], &length.to_le_bytes()[..]].concat();
-        Ok([head, vec![7; length as usize]].concat().into())
+        Ok([head, vec![7; PICTURE]].concat().into())
     }
 }
 
-#[tokio::test]
-async fn answers_to_calls_count_as_the_viewers() {
-    let definitions = [("lab/srv/Shoot", "---\nuint8[] data\n")];
-    let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
-    let registry = Registry::with_definitions(RosVersion::Two, &definitions.into()).expect("valid");
-    let registry = Arc::new(registry);
-    let of = ServiceType::from_service(&registry.service("lab/Shoot").expect("defined"));
-    let system = Arc::new(MemorySystem::default());
-    let node = system.join("/see");
-    let serving = node.serve("/shoot", of, Arc::new(Pictures));
-    let _serving = serving.await.expect("served");
-    for (limit, is_answered) in [(4 << 20, true), (1 << 20, false)] {
-        let budget = Budget::new("viewer x", limit);
-        let (mut viewer, serving) = open_viewer(&system, Arc::clone(&registry), &budget);
+/// Size of these images in bytes.
+const PICTURE: usize = 1 << 20;
+
+/// A servant with this service.
+struct Camera {
+    system: Arc<MemorySystem>,
+    registry: Arc<Registry>,
+    // Kept as long as it is viewed.
+    _node: Arc<dyn Bus>,
+    _serving: Box<dyn Send + Sync>,
+}
+
+impl Camera {
+    async fn new() -> Self {
+        let definitions = [("lab/srv/Shoot", "---\nuint8[] data\n")];
+        let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
+        let registry = Registry::with_definitions(RosVersion::Two, &definitions.into()).expect("valid");
+        let of = ServiceType::from_service(&registry.service("lab/Shoot").expect("defined"));
+        let system = Arc::new(MemorySystem::default());
+        let node: Arc<dyn Bus> = system.join("/see");
+        let serving = node.serve("/shoot", of, Arc::new(Pictures)).await.expect("served");
+        Self { system, registry: Arc::new(registry), _node: node, _serving: serving }
+    }
+
+    /// Connects a viewer with this budget, which calls the service; also returns the task that serves it.
+    async fn open_calling_viewer(&self, budget: &Budget) -> (Viewer, JoinHandle<()>) {
+        let (mut viewer, serving) = open_viewer(&self.system, Arc::clone(&self.registry), budget);
         let told = viewer.next_text("advertiseServices").await;
         let id = told["services"][0]["id"].as_u64().expect("a number") as u32;
         let mut call = vec![2];
@@ -118,10 +131,30 @@ async fn answers_to_calls_count_as_the_viewers() {
         }
         call.extend_from_slice(b"cdr\0\x01\0\0\0");
         viewer.send(2, &call).await;
+        (viewer, serving)
+    }
+}
+
+/// Waits until a number of bytes is in use.
+async fn wait_for_use(budget: &Budget, is_so: impl Fn(usize) -> bool) {
+    let changes = async {
+        while !is_so(budget.used_bytes()) {
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(PATIENCE, changes).await.unwrap_or_else(|_| panic!("{} bytes are in use", budget.used_bytes()));
+}
+
+#[tokio::test]
+async fn answers_to_calls_count_as_the_viewers() {
+    let camera = Camera::new().await;
+    for (limit, is_answered) in [(4 << 20, true), (1 << 20, false)] {
+        let budget = Budget::new("viewer x", limit);
+        let (mut viewer, serving) = camera.open_calling_viewer(&budget).await;
         if is_answered {
-            let (opcode, answer) = timeout(LONG, viewer.next_frame()).await.expect("an answer");
+            let (opcode, answer) = timeout(PATIENCE, viewer.next_frame()).await.expect("an answer");
             assert_eq!((opcode, answer[0]), (2, 3));
-            assert!(answer.len() > 1 << 20);
+            assert!(answer.len() > PICTURE);
         } else {
             let failure = viewer.next_text("serviceCallFailure").await;
             let words = failure["message"].as_str().expect("a text");
@@ -132,6 +165,22 @@ async fn answers_to_calls_count_as_the_viewers() {
         serving.await.expect("it ends");
         assert_eq!(budget.used_bytes(), 0);
     }
+}
+
+#[tokio::test]
+async fn an_answer_counts_until_the_viewer_has_read_it() {
+    let camera = Camera::new().await;
+    let budget = Budget::new("viewer x", 4 << 20);
+    let (mut viewer, _serving) = camera.open_calling_viewer(&budget).await;
+    // Nothing else of this size counts: the request is short, and the viewer reads nothing.
+    wait_for_use(&budget, |bytes| bytes > PICTURE).await;
+    for _ in 0..100 {
+        tokio::task::yield_now().await;
+    }
+    assert!(budget.used_bytes() > PICTURE, "it waits, and is not counted");
+    let (_, answer) = timeout(PATIENCE, viewer.next_frame()).await.expect("an answer");
+    assert!(answer.len() > PICTURE);
+    wait_for_use(&budget, |bytes| bytes < PICTURE).await;
 }
 
 #[tokio::test]
@@ -179,10 +228,10 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     let id = channel["id"].clone();
     let wanted = json!({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": id}]});
     viewer.send(1, wanted.to_string().as_bytes()).await;
-    timeout(LONG, wait_for_connected(seen.matched_subscribers(), 1)).await.expect("it subscribes");
+    timeout(PATIENCE, wait_for_connected(seen.matched_subscribers(), 1)).await.expect("it subscribes");
     let message = [0, 1, 0, 0, 0, 0, 0, 0];
     seen.publish(Bytes::copy_from_slice(&message));
-    let (opcode, frame) = timeout(LONG, viewer.next_frame()).await.expect("a message");
+    let (opcode, frame) = timeout(PATIENCE, viewer.next_frame()).await.expect("a message");
     // Opcode, subscription id, time, then the unchanged message.
     assert_eq!((opcode, frame[0], &frame[1..5]), (2, 1, &[7, 0, 0, 0][..]));
     assert_eq!(&frame[13..], &message);

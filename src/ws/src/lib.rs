@@ -28,7 +28,7 @@ use tokio_util::io::poll_read_buf;
 use frame::Header;
 
 /// Payloads up to this size are copied behind their headers, so that many go into one write.
-const COPIED: usize = 8 * 1024;
+const MAX_COPIED: usize = 8 * 1024;
 /// Smallest free space in the buffer for a read, in bytes.
 const READ_SIZE: usize = 32 * 1024;
 /// Space reserved for a payload before any of it has arrived; more is added as it arrives.
@@ -316,7 +316,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
         Header::write(&mut self.tail, opcode, payload.len(), None);
         self.queued += self.tail.len() - before + payload.len();
-        if payload.len() <= COPIED {
+        if payload.len() <= MAX_COPIED {
             self.tail.extend_from_slice(&payload);
         } else {
             self.write.push_back(self.tail.split().freeze());

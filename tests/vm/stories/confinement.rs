@@ -11,11 +11,11 @@ use crate::machine::daemon;
 
 /// Volume and egress address, as configured in `tests/vm/home`.
 const MODELS: &str = "/run/cloudroid-vm/models";
-const OUT: &str = "127.0.0.1:8098";
+const OUTSIDE_ADDRESS: &str = "127.0.0.1:8098";
 
 /// Returns lines of the `[allow]` section.
 pub fn allow_config() -> String {
-    format!("devices = [\"{KIND}=*\"]\nvolumes = [\"{MODELS}\"]\negress = [\"{OUT}\"]")
+    format!("devices = [\"{KIND}=*\"]\nvolumes = [\"{MODELS}\"]\negress = [\"{OUTSIDE_ADDRESS}\"]")
 }
 
 pub fn no_attempt_to_break_out_succeeds() -> Verdict {
@@ -33,7 +33,7 @@ pub fn neighbours_are_not_reached() -> Verdict {
 pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     let _specification = CdiSpecification::write(KIND)?;
     create_models(Path::new(MODELS))?;
-    let listener = TcpListener::bind(OUT)?;
+    let listener = TcpListener::bind(OUTSIDE_ADDRESS)?;
     let mut robot = daemon()?.robot("granted?robot=given")?;
     check_grants(&mut robot, &listener)?;
     daemon()?.deployer().run(&["stop", "--service", "granted"])?.expect_success()?;

@@ -47,18 +47,21 @@ pub fn removes() -> Verdict {
     let _robot = daemon.robot("greeter_cpp?robot=last")?.call("/greeter/count", json!({}))?;
     let id = daemon.servant_of("greeter_cpp", "last")?["id"].clone();
     // As a build would leave them, for the next story.
-    run_program("sh", &["-c", &format!("mkdir {BUILT} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT}")])?;
+    run_program(
+        "sh",
+        &["-c", &format!("mkdir {BUILT_PROGRAMS} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT_PROGRAMS}")],
+    )?;
     let log = run_program("dpkg", &["--purge", "cloudroid"])?;
     nothing_but_the_state_is_left(id.as_str().context("an id")?).context(log)
 }
 
 /// Directory of programs, as a build leaves them.
-const BUILT: &str = "/var/built";
+const BUILT_PROGRAMS: &str = "/var/built";
 
 /// Runs the scripts that `make install`, after building, and `make uninstall` run.
 pub fn installs_and_removes_without_a_package() -> Verdict {
     let script = |name: &str| format!("/stage/source/scripts/{name}");
-    let said = run_program(&script("install"), &[BUILT, "", "/usr/local"])?;
+    let said = run_program(&script("install"), &[BUILT_PROGRAMS, "", "/usr/local"])?;
     ensure!(said.contains("installed and running"), "{said}");
     ensure!(property("cloudroid.service", "ActiveState")? == "active");
     ensure!(property("cloudroid.service", "FragmentPath")?.starts_with("/usr/local/"), "another unit runs");
@@ -75,7 +78,7 @@ pub fn installs_and_removes_without_a_package() -> Verdict {
     let servants = asks(&["servants"])?;
     let id = servants[0]["id"].as_str().context("an id")?.to_owned();
     let said = run_program(&script("uninstall"), &["/usr/local"])?;
-    run_program("rm", &["-r", BUILT, "/etc/cloudroid"])?;
+    run_program("rm", &["-r", BUILT_PROGRAMS, "/etc/cloudroid"])?;
     nothing_but_the_state_is_left(&id).context(said)
 }
 
@@ -93,7 +96,7 @@ fn nothing_but_the_state_is_left(id: &str) -> Verdict {
             *path != HOME
                 && !path.starts_with("/var/lib/dpkg/")
                 && !path.starts_with("/var/log/")
-                && !path.starts_with(BUILT)
+                && !path.starts_with(BUILT_PROGRAMS)
         })
         .collect();
     ensure!(left.is_empty(), "{left:#?}");

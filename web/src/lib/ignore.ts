@@ -3,46 +3,115 @@ import type { Entry } from './tar';
 
 export const IGNORE_FILE = '.cloudroidignore';
 
+/** A part of a pattern. */
+type Token =
+  | { kind: 'character'; character: string }
+  /** `?`: one character of a name. */
+  | { kind: 'one' }
+  /** `*`: any part of a name. */
+  | { kind: 'run' }
+  /** `[a-z]`: one character of a name, in (or, negated, outside of) these ranges. */
+  | { kind: 'class'; negated: boolean; ranges: [string, string][] }
+  /** A `**` before a slash: any number of whole directories. */
+  | { kind: 'directories' }
+  /** A `**` at the end: everything below. */
+  | { kind: 'rest' };
+
 interface Rule {
-  pattern: RegExp;
+  pattern: Token[];
   /** The line begins with `!`: matching files are sent. */
   negated: boolean;
   /** The line ends with `/`: only directories match. */
   directories: boolean;
 }
 
-const literal = (text: string) => text.replace(/[\\^$.*+?()[\]{}|/-]/g, '\\$&');
+/** The members of a class, as written between its brackets. */
+function ranges(members: string[]): [string, string][] {
+  const found: [string, string][] = [];
+  for (let at = 0; at < members.length; ) {
+    const isRange = members[at + 1] === '-' && at + 2 < members.length;
+    found.push([members[at]!, members[isRange ? at + 2 : at]!]);
+    at += isRange ? 3 : 1;
+  }
+  return found;
+}
 
-/** The expression for a pattern, without its `!` and last `/`. */
-function expression(line: string): RegExp {
-  const anchored = line.includes('/');
+/** The parts of a pattern, without its `!` and last `/`. */
+function tokens(line: string): Token[] {
+  const found: Token[] = line.includes('/') ? [] : [{ kind: 'directories' }];
   let rest = line.replace(/^\//, '');
-  let source = anchored ? '' : '(?:.*/)?';
   let beginsName = true;
   while (rest) {
     const begins = beginsName;
     beginsName = false;
     const group = /^\[([!^]?)(\]?[^\]]*)\]/.exec(rest);
     if (begins && rest === '**') {
-      source += '.+';
+      found.push({ kind: 'rest' });
       rest = '';
     } else if (begins && rest.startsWith('**/')) {
-      source += '(?:.*/)?';
+      found.push({ kind: 'directories' });
       rest = rest.slice(3);
       beginsName = true;
     } else if (rest.startsWith('[')) {
       if (!group?.[2]) throw new Error(`${IGNORE_FILE}: ${rest} has no ]`);
-      source += `(?!/)[${group[1] ? '^' : ''}${group[2].replace(/[\\\]^[]/g, '\\$&')}]`;
+      found.push({ kind: 'class', negated: !!group[1], ranges: ranges([...group[2]]) });
       rest = rest.slice(group[0].length);
     } else {
       const escaped = rest.startsWith('\\') && rest.length > 1;
-      const sign = rest.charAt(escaped ? 1 : 0);
-      source += !escaped && sign === '*' ? '[^/]*' : !escaped && sign === '?' ? '[^/]' : literal(sign);
-      beginsName = sign === '/';
-      rest = rest.slice(escaped ? 2 : 1);
+      const character = String.fromCodePoint(rest.codePointAt(escaped ? 1 : 0)!);
+      const kind = escaped ? 'character' : character === '*' ? 'run' : character === '?' ? 'one' : 'character';
+      found.push(kind === 'character' ? { kind, character } : { kind });
+      beginsName = character === '/';
+      rest = rest.slice((escaped ? 1 : 0) + character.length);
     }
   }
-  return new RegExp(`^${source}$`, 's');
+  return found;
+}
+
+/** Whether a token may go on matching after a character, and whether the next one begins after it. */
+function takes(token: Token, character: string): [boolean, boolean] {
+  switch (token.kind) {
+    case 'character':
+      return [false, token.character === character];
+    case 'one':
+      return [false, character !== '/'];
+    case 'run':
+      return [character !== '/', false];
+    case 'class': {
+      const isWithin = token.ranges.some(([first, last]) => first <= character && character <= last);
+      return [false, character !== '/' && isWithin !== token.negated];
+    }
+    case 'directories':
+      return [true, false];
+    case 'rest':
+      return [true, true];
+  }
+}
+
+/**
+ * Whether a path matches. All ways to match are followed at once, so the time is bounded by the product of the lengths, whatever
+ * the pattern is.
+ */
+function matches(pattern: Token[], path: string): boolean {
+  /** Goes on after tokens that may match nothing. */
+  const skipEmpty = (reached: boolean[], beginsName: boolean) =>
+    pattern.forEach(({ kind }, at) => {
+      if (reached[at] && (kind === 'run' || (kind === 'directories' && beginsName))) reached[at + 1] = true;
+    });
+  let reached: boolean[] = [true];
+  skipEmpty(reached, true);
+  for (const character of path) {
+    const next: boolean[] = [];
+    pattern.forEach((token, at) => {
+      if (!reached[at]) return;
+      const [stays, goesOn] = takes(token, character);
+      if (stays) next[at] = true;
+      if (goesOn) next[at + 1] = true;
+    });
+    skipEmpty(next, character === '/');
+    reached = next;
+  }
+  return !!reached[pattern.length];
 }
 
 function rules(text: string): Rule[] {
@@ -53,7 +122,7 @@ function rules(text: string): Rule[] {
     if (negated) line = line.slice(1);
     const directories = line.endsWith('/');
     if (directories) line = line.slice(0, -1);
-    return line.replace(/^\//, '') ? [{ pattern: expression(line), negated, directories }] : [];
+    return line.replace(/^\//, '') ? [{ pattern: tokens(line), negated, directories }] : [];
   });
 }
 
@@ -72,7 +141,7 @@ export async function unignored(all: Entry[]): Promise<Entry[]> {
     for (const { base, rules } of known) {
       if (!path.startsWith(base)) continue;
       const below = path.slice(base.length);
-      const found = rules.findLast((rule) => (isDirectory || !rule.directories) && rule.pattern.test(below));
+      const found = rules.findLast((rule) => (isDirectory || !rule.directories) && matches(rule.pattern, below));
       if (found) return !found.negated;
     }
     return false;

@@ -1066,6 +1066,7 @@ export interface Stated {
 }
 
 export interface Status {
+  architecture: string;
   black_box: number;
   capacity: Capacity;
   certificate?: string;

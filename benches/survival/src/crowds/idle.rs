@@ -18,12 +18,12 @@ const PACE: Duration = Duration::from_millis(50);
 
 pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     let alone = time_calls(daemon, SILENCE / 2)?;
-    let before = Resources::read(daemon.pid())?;
+    let before = Resources::read(daemon)?;
     let crowd = IdleCrowd::connect(&daemon.url(&greeters::robot_path("crowd")), IDLE)?;
     // Longer than the time after which clients that answer no pings are disconnected.
     let time = SILENCE * 3 / 2;
     let beside = time_calls(daemon, time)?;
-    let grown = Resources::read(daemon.pid())?.anonymous - before.anonymous;
+    let grown = Resources::read(daemon)?.anonymous - before.anonymous;
     let answered = crowd.ask_and_leave()?;
     let title = format!("idle WebSockets of {IDLE} that are answered");
     report

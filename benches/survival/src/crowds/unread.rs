@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Process, Target};
 use serde_json::json;
 use support::daemon::Daemon;
 use support::robot::Robot;
@@ -11,7 +11,6 @@ use support::robot::Robot;
 use super::join_thread;
 use crate::greeters;
 use crate::milliseconds::quantile;
-use crate::resources::Resources;
 
 /// Number of clients that never read. They do not answer pings either and are disconnected for that, but the messages
 /// are published before.
@@ -49,7 +48,7 @@ pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         reader.call("/rosapi/get_time", json!({}))?;
         readers.push(reader);
     }
-    let before = Resources::read(daemon.pid())?.resident;
+    let before = Process::from_pid(daemon.pid()).resident()?;
     let for_readers = publish_and_call(daemon)?;
     let PublishingSample { messages, times, most } = for_readers;
     let title = format!("memory of the daemon with {READERS} clients that never read");
@@ -94,7 +93,7 @@ fn publish_and_call(daemon: &Daemon) -> Result<PublishingSample> {
             let asked = Instant::now();
             greeters::greeting_count(&mut robot)?;
             times.push(asked.elapsed());
-            most = most.max(Resources::read(daemon.pid())?.resident);
+            most = most.max(Process::from_pid(daemon.pid()).resident()?);
         }
         join_thread(publishing)
     })?;

@@ -1,4 +1,5 @@
-//! The load: twenty robots of several kinds, and an operator who queries the API.
+//! The load: twenty robots of several kinds, half of them with a service of ROS 1 and half with one of ROS 2, and an
+//! operator who queries the API.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,12 +16,12 @@ use support::twins::{self, Twin};
 
 use crate::greeters;
 
-/// Twenty robots in all.
-const CALLERS: usize = 8;
-const TALKERS: usize = 4;
-const RETURNERS: usize = 4;
-const NAMELESS: usize = 2;
-const LINKED: usize = 2;
+/// Versions of ROS of the services.
+pub(super) const BOTH: [RosVersion; 2] = [RosVersion::One, RosVersion::Two];
+/// Robots of each kind for each version of ROS; twenty in all, with one without a name and one with a stub for each.
+const CALLERS: usize = 4;
+const TALKERS: usize = 2;
+const RETURNERS: usize = 2;
 /// Interval between two actions of a robot.
 const PACE: Duration = Duration::from_millis(100);
 /// Interval for robots that return, or have no name and are given a servant of their own.
@@ -42,8 +43,34 @@ pub(super) struct Tally {
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CallSample {
+    pub(super) ros: RosVersion,
     pub(super) made: Instant,
     pub(super) took: Duration,
+}
+
+/// Publishes the node of ROS 2.
+pub(super) fn publish_twin(daemon: &Daemon) -> Result<()> {
+    let service = Twin::greeter(RosVersion::Two).service;
+    eprintln!("pushing {}", service.name);
+    let package = service.package.context("a package of ours")?;
+    daemon.deployer().push(package, &["--node", "greeter"])?.expect_success().map(drop)
+}
+
+/// Returns the URL path of a robot's servant.
+fn robot_path(ros: RosVersion, robot: &str) -> String {
+    format!("{}?robot={robot}", Twin::greeter(ros).service.name)
+}
+
+/// Calls the node.
+fn call_node(robot: &mut Robot, ros: RosVersion) -> Result<()> {
+    match ros {
+        RosVersion::One => greeters::greeting_count(robot).map(drop),
+        RosVersion::Two => {
+            let answer = robot.call("/greeter/count", json!({}))?;
+            ensure!(answer["values"]["success"] == true, "{answer}");
+            Ok(())
+        }
+    }
 }
 
 /// All robots at work.
@@ -60,23 +87,23 @@ impl<'a> MixedLoad<'a> {
 
     /// Starts all robots, each on a thread of its own; they work until [`MixedLoad::end`].
     pub(super) fn start<'scope>(&'scope self, scope: &'scope Scope<'scope, '_>) {
-        for number in 0..CALLERS {
-            scope.spawn(move || self.run_caller(&format!("caller-{number}")));
-        }
-        for number in 0..TALKERS {
-            scope.spawn(move || self.run_talker(&format!("talker-{number}")));
-        }
-        for number in 0..RETURNERS {
-            scope.spawn(move || self.run_returner(&format!("returner-{number}")));
-        }
-        for _ in 0..NAMELESS {
-            scope.spawn(|| self.run_visitor());
-        }
-        scope.spawn(|| {
-            if let Err(error) = self.run_links() {
-                self.fail("robots with stubs", &error);
+        for ros in BOTH {
+            for number in 0..CALLERS {
+                scope.spawn(move || self.run_caller(ros, &format!("caller-{number}-{}", ros.number())));
             }
-        });
+            for number in 0..TALKERS {
+                scope.spawn(move || self.run_talker(ros, &format!("talker-{number}-{}", ros.number())));
+            }
+            for number in 0..RETURNERS {
+                scope.spawn(move || self.run_returner(ros, &format!("returner-{number}-{}", ros.number())));
+            }
+            scope.spawn(move || self.run_visitor(ros));
+            scope.spawn(move || {
+                if let Err(error) = self.run_link(ros) {
+                    self.fail("a robot with a stub", &error);
+                }
+            });
+        }
         scope.spawn(|| self.run_operator());
     }
 
@@ -115,7 +142,7 @@ impl<'a> MixedLoad<'a> {
     /// Repeats an action on one connection for as long as that works.
     fn repeat_connected(
         &self,
-        robot: &str,
+        (ros, robot): (RosVersion, &str),
         begin: impl Fn(&mut Robot) -> Result<()>,
         act: impl Fn(&mut Robot) -> Result<()>,
     ) {
@@ -124,7 +151,7 @@ impl<'a> MixedLoad<'a> {
             let mut connected = match connection.take() {
                 Some(connected) => connected,
                 None => {
-                    let mut connected = self.connect(&greeters::robot_path(robot))?;
+                    let mut connected = self.connect(&robot_path(ros, robot))?;
                     begin(&mut connected)?;
                     connected
                 }
@@ -140,17 +167,21 @@ impl<'a> MixedLoad<'a> {
     }
 
     /// Calls the service, publishes a name, sets a parameter and queries topics.
-    fn run_caller(&self, robot: &str) {
+    fn run_caller(&self, ros: RosVersion, robot: &str) {
+        let (name, value) = match ros {
+            RosVersion::One => ("/kept", "[1, 2]"),
+            RosVersion::Two => ("/greeter:word", "\"hi\""),
+        };
         let begin = |robot: &mut Robot| {
             robot.send(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))
         };
-        self.repeat_connected(robot, begin, |robot| {
+        self.repeat_connected((ros, robot), begin, |robot| {
             let made = Instant::now();
-            greeters::greeting_count(robot)?;
+            call_node(robot, ros)?;
             let took = made.elapsed();
-            self.record(|tally| tally.calls.push(CallSample { made, took }));
+            self.record(|tally| tally.calls.push(CallSample { ros, made, took }));
             robot.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
-            let set = json!({"name": "/kept", "value": "[1, 2]"});
+            let set = json!({"name": name, "value": value});
             let set = robot.call("/rosapi/set_param", set)?;
             let topics = robot.call("/rosapi/topics", json!({}))?;
             ensure!(set["result"] == true && topics["result"] == true, "{set} {topics}");
@@ -159,13 +190,13 @@ impl<'a> MixedLoad<'a> {
     }
 
     /// Receives its own publications, which are large.
-    fn run_talker(&self, robot: &str) {
+    fn run_talker(&self, ros: RosVersion, robot: &str) {
         let begin = |robot: &mut Robot| {
             robot.send(json!({"op": "advertise", "topic": "/talk", "type": "std_msgs/String"}))?;
             robot.subscribe("/talk")
         };
         let message = json!({"op": "publish", "topic": "/talk", "msg": {"data": "x".repeat(MESSAGE)}});
-        self.repeat_connected(robot, begin, |robot| {
+        self.repeat_connected((ros, robot), begin, |robot| {
             let is_it = |heard: &serde_json::Value| heard["topic"] == "/talk";
             robot.send_until(&message, "its own words", is_it)?;
             Ok(())
@@ -173,40 +204,35 @@ impl<'a> MixedLoad<'a> {
     }
 
     /// Leaves and resumes its session with the previous subscriptions.
-    fn run_returner(&self, robot: &str) {
-        let path = format!("{}&resume=a-secret-of-{robot}", greeters::robot_path(robot));
+    fn run_returner(&self, ros: RosVersion, robot: &str) {
+        let path = format!("{}&resume=a-secret-of-{robot}", robot_path(ros, robot));
         self.repeat(robot, VISIT, || {
             let mut robot = self.connect(&path)?;
             robot.subscribe("/greeter/greeting")?;
-            greeters::greeting_count(&mut robot)?;
+            call_node(&mut robot, ros)?;
             robot.leave()
         });
     }
 
     /// Connects without a name, so that its servant ends when it leaves.
-    fn run_visitor(&self) {
+    fn run_visitor(&self, ros: RosVersion) {
         self.repeat("a robot without a name", VISIT, || {
-            let mut robot = self.connect(greeters::SERVICE)?;
-            greeters::greeting_count(&mut robot)?;
+            let mut robot = self.connect(Twin::greeter(ros).service.name)?;
+            call_node(&mut robot, ros)?;
             robot.leave()
         });
     }
 
-    /// Makes calls through stubs.
-    fn run_links(&self) -> Result<()> {
-        let (site, twin) = (Site::new()?, Twin::greeter(RosVersion::One));
-        let app = site.node("/app")?;
-        let ask = |number: usize| twins::greeting_count(&site, &app, &format!("/link{number}"));
-        let mut stubs = Vec::new();
-        for number in 0..LINKED {
-            let argv = twin.argv(&format!("link{number}"), &[]);
-            let robot = format!("soaked-{number}");
-            let stub = twin.stub(&site, (&self.daemon.address, &robot), "", &argv)?;
-            support::wait_until("a link", || Ok(ask(number).map_err(|error| format!("{error:#}"))))
-                .with_context(|| stub.output())?;
-            stubs.push(stub);
-        }
-        self.repeat("robots with stubs", PACE, || (0..LINKED).try_for_each(|number| ask(number).map(drop)));
+    /// Makes calls through a stub.
+    fn run_link(&self, ros: RosVersion) -> Result<()> {
+        let (site, twin) = (Site::with_ros(ros)?, Twin::greeter(ros));
+        let app = site.join("/app")?;
+        let ask = || twins::greeting_count(&site, &app, "/link");
+        let argv = twin.argv("link", &[]);
+        let stub = twin.stub(&site, (&self.daemon.address, &twin.robot_name("soaked")), "", &argv)?;
+        support::wait_until("a link", || Ok(ask().map_err(|error| format!("{error:#}"))))
+            .with_context(|| stub.output())?;
+        self.repeat("a robot with a stub", PACE, || ask().map(drop));
         Ok(())
     }
 

@@ -1,29 +1,24 @@
 //! Messages to send, and the results of codecs on them without a network.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use bytes::Bytes;
 use codec::{Codec, Encoder, Schema};
+use ros::bus::{RosVersion, WireType};
 use serde::{Deserialize, Serialize};
-use support::people::picture;
+use support::layout::MessageLayout;
 
 use super::{CLASS, Kind};
-use crate::cells::{CachedResult, RunCache};
-use crate::deadline;
+use crate::cells::RunCache;
 use crate::examples::{EvalFixtures, ExecutionSite, InputRecording, LASER_SLAM};
+use crate::pictures;
 use crate::place::NetworkProfile;
 use crate::recording::Recording;
 use crate::robot::RobotPlan;
-use crate::stream::{self, StreamHeader};
+use crate::stream::{self, TopicType};
 use crate::trace::MapGrid;
 
-/// Colour photographs of Debian's opencv-doc.
-const PHOTOGRAPHS: [&str; 6] = ["aloeL.jpg", "baboon.jpg", "board.jpg", "fruits.jpg", "home.jpg", "building.jpg"];
-const PLACE: &str = "/usr/share/doc/opencv-doc/examples/data";
-const SIZE: (u32, u32) = (640, 480);
 /// Number of scans of the drive from which the map is built, and the interval between them.
 const SCANS: (usize, usize) = (150, 3);
 /// Cells per side of the large map, as gmapping uses them.
@@ -35,9 +30,6 @@ const HEAD: usize = 99;
 /// Number of messages for codecs without a network.
 const TRIED: usize = 6;
 
-/// Maximum time to scale one photograph.
-const LONGEST: Duration = Duration::from_secs(60);
-
 /// Sources of the messages.
 pub(super) struct StreamSources<'a> {
     pub(super) cells: &'a RunCache,
@@ -48,7 +40,6 @@ pub(super) struct StreamSources<'a> {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct OfflineResult {
     pub(super) codecs: Vec<CodecOutput>,
-    /// Fraction of a map's cells that are known.
     pub(super) known: Option<f64>,
 }
 
@@ -58,29 +49,23 @@ pub(super) struct CodecOutput {
     pub(super) codec: String,
     /// True if the codec is our own.
     pub(super) ours: bool,
-    /// Bytes of messages and of frames.
     pub(super) bytes: [u64; 2],
 }
 
 impl StreamSources<'_> {
-    /// Writes a file of messages of this kind.
     pub(super) fn recording(&self, kind: Kind, directory: &Path) -> Result<PathBuf> {
         if kind == Kind::Video {
             return self.workshop.recording(InputRecording::Pictures);
         }
         let path = directory.join("sent.messages");
-        match kind {
-            Kind::Video | Kind::Pictures => {
-                stream::write(&path, &StreamHeader::for_pictures(ROUNDS), &photographs()?)?;
-            }
-            Kind::Map => {
-                stream::write(&path, &StreamHeader::for_maps(ROUNDS), &[serialize_grid(&self.source_map()?)?])?
-            }
-            Kind::LargeMap => {
-                let large = centre_in_grid(&self.source_map()?, LARGE)?;
-                stream::write(&path, &StreamHeader::for_maps(ROUNDS), &[serialize_grid(&large)?])?;
-            }
+        if kind == Kind::Pictures {
+            pictures::write_pictures(&path, &pictures::photographs()?, ROUNDS)?;
+            return Ok(path);
         }
+        let map = self.source_map()?;
+        let map = if kind == Kind::LargeMap { centre_in_grid(&map, LARGE)? } else { map };
+        let of = WireType::new("nav_msgs/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e", MAP);
+        stream::write(&path, &[TopicType::new("/map", &of)], &[vec![serialize_grid(&map)?]], ROUNDS)?;
         Ok(path)
     }
 
@@ -92,10 +77,8 @@ impl StreamSources<'_> {
             let (trace, _) = self.workshop.run(&LASER_SLAM, at, robot, adapt)?;
             trace.map.context("laser_slam published no map")
         })?;
-        match map {
-            CachedResult::Done(map) => Ok(map),
-            CachedResult::Missing(why) => anyhow::bail!("there is no map to be sent: {why}"),
-        }
+        let why = || format!("there is no map to be sent: {}", map.missing.as_deref().unwrap_or_default());
+        map.first().cloned().with_context(why)
     }
 
     /// Encodes such messages with the published codecs and with ours.
@@ -130,32 +113,6 @@ impl StreamSources<'_> {
     }
 }
 
-/// Returns unrelated photographs.
-fn photographs() -> Result<Vec<Bytes>> {
-    let read = |name: &&str| {
-        let path = Path::new(PLACE).join(name);
-        ensure!(path.exists(), "{} is missing; it comes with Debian's opencv-doc: make deps", path.display());
-        let mut command = Command::new("ffmpeg");
-        command
-            .args(["-v", "error", "-i"])
-            .arg(&path)
-            .args(["-vf", "scale=640:480", "-frames:v", "1", "-pix_fmt"])
-            .args(["bgr24", "-f", "rawvideo", "-"]);
-        let output = deadline::output(&mut command, LONGEST)?;
-        let size = (SIZE.0 * SIZE.1 * 3) as usize;
-        ensure!(
-            output.status.success() && output.stdout.len() == size,
-            "ffmpeg made {} bytes of {}: {}",
-            output.stdout.len(),
-            path.display(),
-            String::from_utf8_lossy(&output.stderr).trim()
-        );
-        Ok(picture(1, SIZE, &output.stdout))
-    };
-    PHOTOGRAPHS.iter().map(read).collect()
-}
-
-/// Returns the fraction of known cells.
 fn known_share(cells: &[u8]) -> f64 {
     let known = cells.iter().filter(|cell| **cell != u8::MAX).count();
     known as f64 / cells.len().max(1) as f64
@@ -163,23 +120,29 @@ fn known_share(cells: &[u8]) -> f64 {
 
 /// Serializes a `nav_msgs/OccupancyGrid`.
 fn serialize_grid(grid: &MapGrid) -> Result<Bytes> {
-    let mut bytes = Vec::with_capacity(grid.cells.len() + 100);
-    let words = |bytes: &mut Vec<u8>, words: &[u32]| {
-        words.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
-    };
-    words(&mut bytes, &[1, 1, 0, 3]);
-    bytes.extend(b"map");
-    words(&mut bytes, &[0, 0]);
-    bytes.extend((grid.resolution as f32).to_le_bytes());
-    words(&mut bytes, &[u32::try_from(grid.width)?, u32::try_from(grid.height)?]);
+    let mut out = MessageLayout::new(RosVersion::One);
+    let (width, height) = (u32::try_from(grid.width)?, u32::try_from(grid.height)?);
+    out.header(1, "map").u32(0).u32(0).f32(grid.resolution as f32).u32(width).u32(height);
     let [x, y] = grid.origin;
     for number in [x, y, 0.0, 0.0, 0.0, 0.0, 1.0] {
-        bytes.extend(number.to_le_bytes());
+        out.f64(number);
     }
-    words(&mut bytes, &[u32::try_from(grid.cells.len())?]);
-    bytes.extend(grid.cells.iter().map(|cell| *cell as u8));
-    Ok(bytes.into())
+    Ok(out.bytes(&grid.cells.iter().map(|cell| *cell as u8).collect::<Vec<_>>()).finish())
 }
+
+/// Definition of `nav_msgs/OccupancyGrid`.
+const MAP: &str = "std_msgs/Header header\nMapMetaData info\nint8[] data\n\
+    ================================================================================\n\
+    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n\
+    ================================================================================\n\
+    MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose \
+    origin\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n\
+    ================================================================================\n\
+    MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n";
 
 /// Returns a map of `side` x `side` cells with `grid` at its centre; the cells around it are unknown.
 fn centre_in_grid(grid: &MapGrid, side: usize) -> Result<MapGrid> {

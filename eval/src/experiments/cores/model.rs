@@ -1,46 +1,22 @@
 //! A model of response times as sums of parts, each modelled separately: some parts of a response are work that cores
 //! share, the others are not.
 
-use crate::statistics::{RrtModel, mean};
-use crate::trace::Trace;
+use crate::statistics::RrtModel;
+use crate::trace::ResponseParts;
 
-/// Names of [`ResponseParts`], in their order.
-pub const NAMES: [&str; 4] = ["acquisition", "computation", "rendering", "transport and waiting"];
 /// Index of the algorithm itself.
-const COMPUTATION: usize = 1;
+pub const COMPUTATION: usize = 1;
 /// If a part's number of useful cores is at least this fraction of the greatest measured limit, no limit of parallelism
 /// was observed.
 const NEAR: f64 = 0.97;
 
-/// Means over all requests of one run, in seconds: the durations that the package reports, and the rest of the response
-/// time.
-pub type ResponseParts = [f64; 4];
-
-/// Returns the parts of a run; `None` if the package did not report durations.
-pub fn mean_parts(trace: &Trace) -> Option<ResponseParts> {
-    let both = trace.requests.iter().filter_map(|one| Some((one.response?, one.phases?)));
-    let all: Vec<ResponseParts> = both
-        .map(|(response, phases)| {
-            let told = [phases.acquisition, phases.computation, phases.rendering];
-            let rest = response - told.iter().sum::<f64>();
-            [told[0], told[1], told[2], rest]
-        })
-        .collect();
-    let mut means = ResponseParts::default();
-    for (index, part) in means.iter_mut().enumerate() {
-        *part = mean(&all.iter().map(|one| one[index]).collect::<Vec<_>>())?;
-    }
-    Some(means)
-}
-
 /// A model of each part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Model {
-    /// Models in the order of [`NAMES`].
+    /// Models in the order of [`crate::trace::PART_NAMES`].
     pub parts: [RrtModel; 4],
     /// Greatest number of cores to which the model was fitted.
     pub most: f64,
-    /// Number of threads of the computation.
     pub threads: usize,
 }
 
@@ -73,16 +49,20 @@ impl Model {
         self.predict_cautious(cores) - computation.work / computation.parallel + computation.work / cores
     }
 
+    /// Returns the number of cores above which more cores do not help the computation.
+    pub fn parallel(&self) -> f64 {
+        self.parts[COMPUTATION].parallel
+    }
+
     /// Returns whether more cores stopped helping below the greatest measured number.
     pub fn has_end(&self) -> bool {
-        self.parts[COMPUTATION].parallel < NEAR * self.most
+        self.parallel() < NEAR * self.most
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trace::{ComputationPhases, RequestSample};
 
     fn assert_near(one: f64, other: f64) {
         assert!((one - other).abs() < 1e-6, "{one} is not {other}");
@@ -91,22 +71,6 @@ mod tests {
     /// 1 ms and 2 core seconds of computation that `parallel` cores share, 50 ms of transport.
     fn runs(parallel: f64) -> Vec<(f64, ResponseParts)> {
         [0.25, 0.5, 1.0, 2.0].map(|cores: f64| (cores, [0.001, 2.0 / cores.min(parallel), 0.0, 0.05])).to_vec()
-    }
-
-    #[test]
-    fn what_is_left_is_transport() {
-        let request = |response, computation| RequestSample {
-            response: Some(response),
-            phases: Some(ComputationPhases { acquisition: 0.01, computation, rendering: 0.02 }),
-            ..RequestSample::default()
-        };
-        let mut trace = Trace::default();
-        assert_eq!(mean_parts(&trace), None);
-        trace.requests = vec![request(0.5, 0.4), request(0.7, 0.6), RequestSample::default()];
-        let found = mean_parts(&trace).expect("two are known");
-        for (one, other) in found.into_iter().zip([0.01, 0.5, 0.02, 0.07]) {
-            assert_near(one, other);
-        }
     }
 
     #[test]

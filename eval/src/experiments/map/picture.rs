@@ -116,22 +116,16 @@ mod tests {
         // A bar longer than the map is truncated.
         let bar = (2 + MARGIN) * 2;
         assert_eq!(pixels[bar - 1..bar + 1], [255, 0]);
+        let mut nothing = map([0.0, 0.0]);
+        nothing.cells.fill(-1);
+        assert!(draw_maps(&[&nothing]).is_err() && draw_maps(&[]).is_err());
     }
 
     #[test]
     fn maps_beside_each_other_show_the_same_place() {
-        let (one, other) = (map([0.0, 0.0]), map([1.0, 0.0]));
-        let (width, _, pixels) = decode_drawing(&[&one, &other]);
+        let (width, _, pixels) = decode_drawing(&[&map([0.0, 0.0]), &map([1.0, 0.0])]);
         assert_eq!(width, 3 + MARGIN + 3);
         assert_eq!(pixels[..3], [0, 205, 205]);
         assert_eq!(pixels[3 + MARGIN..width], [205, 0, 205]);
-    }
-
-    #[test]
-    fn a_map_that_knows_nothing_is_not_drawn() {
-        let mut nothing = map([0.0, 0.0]);
-        nothing.cells.fill(-1);
-        assert!(draw_maps(&[&nothing]).is_err());
-        assert!(draw_maps(&[]).is_err());
     }
 }

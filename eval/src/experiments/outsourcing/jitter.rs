@@ -1,105 +1,73 @@
 //! Experiment 5: variation of response times.
 
-use anyhow::Result;
-
-use super::{OutsourcingRun, OutsourcingSetUp, add_missing, examples, find_run};
-use crate::place::NetworkProfile;
+use super::{OutsourcingRun, OutsourcingSetUp, add_missing, examples};
 use crate::plots;
-use crate::section::{Section, Table};
-use crate::statistics::{mean, quantile, standard_deviation};
-use crate::words::milliseconds;
+use crate::section::{About, Section, Table};
+use crate::statistics::{mean, standard_deviation};
+use crate::words::{count, milliseconds};
+
+/// The experiment.
+pub const JITTER: About = About {
+    number: 5,
+    id: "jitter",
+    title: "How much response times differ from request to request",
+    published: "Fig. 6 of the publication: jitter of response times, native and outsourced.",
+    differs: &["LAN and WAN have no jitter of their own here: what is shown is that of the packages, the portal and \
+        the scheduler, which stops a robot with a quarter of a core for most of each tenth of a second."],
+};
 
 /// Creates the section of experiment 5.
-pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
-    let mut section = Section::new(5, "jitter", "How much response times differ from request to request");
-    section.published = "Fig. 6 of the publication: jitter of response times, native and outsourced.".to_owned();
-    section.differs = vec![
-        "The network itself has no jitter here (LAN, WAN): what is shown is that of the packages, \
-        the portal and this machine's scheduler. A robot that has a quarter of a core is stopped by the kernel for \
-        most of each tenth of a second, which is jitter, too."
-            .to_owned(),
-    ];
+pub fn jitter(runs: &[OutsourcingRun]) -> Section {
+    let mut section = JITTER.section();
     let mut table = Table::new(
         "Response times, milliseconds",
-        "package | robot | where | standard deviation | of the mean | 5 % | median | 95 % | 99 %",
+        "package | robot | where | standard deviation | of the mean, % | p50 | p95 | p99",
     );
-    for run in runs {
-        let Some((trace, _)) = run.measured.value() else {
-            continue;
-        };
-        let responses = trace.responses();
-        let deviation = standard_deviation(&responses);
-        let share =
-            deviation.zip(mean(&responses)).map(|(deviation, mean)| format!("{:.0} %", 100.0 * deviation / mean));
-        let at = |share| milliseconds(quantile(&responses, share));
-        table.push([
-            run.example.name.to_owned(),
-            run.class.name().to_owned(),
-            run.set_up.name().to_owned(),
-            milliseconds(deviation),
-            share.unwrap_or_default(),
-            at(0.05),
-            at(0.5),
-            at(0.95),
-            at(0.99),
-        ]);
-        let native = find_run(runs, run.example.name, run.class, OutsourcingSetUp::Native);
-        if let (OutsourcingSetUp::Behind(network), Some((native, _))) = (run.set_up, native) {
-            let told = steadiness_finding(run, network, &native.responses(), &responses);
-            section.findings.extend(told);
+    for run in runs.iter().filter(|run| !run.measured.done.is_empty()) {
+        let deviation = run.measured.figure(|(trace, _)| standard_deviation(&trace.responses()));
+        let share = run.measured.figure(|(trace, _)| {
+            let responses = trace.responses();
+            Some(100.0 * standard_deviation(&responses)? / mean(&responses)?)
+        });
+        let mut row = run.labels().map(str::to_owned).to_vec();
+        row.extend([milliseconds(deviation), count(share)]);
+        row.extend(run.measured.percentiles(|(trace, _)| trace.responses()).map(milliseconds));
+        table.push(row);
+        if let (OutsourcingSetUp::Behind(network), Some(native)) = (run.set_up, run.native(runs)) {
+            let on_robot = native.measured.figure(|(trace, _)| standard_deviation(&trace.responses()));
+            section.findings.extend(deviation.zip(on_robot).map(|(here, there)| {
+                format!(
+                    "{} by {}: response times differ {} outsourced than on a robot of the class {} (standard \
+                     deviations {} and {} ms).",
+                    run.example.name,
+                    network.name(),
+                    if here.median < there.median { "less" } else { "more, worse than hoped," },
+                    run.class.name(),
+                    milliseconds(deviation),
+                    milliseconds(on_robot)
+                )
+            }));
         }
     }
     section.tables.push(table);
     for example in examples(runs) {
         let of = runs.iter().filter(|run| run.example.name == example.name);
-        let series = of.filter_map(|run| {
-            let name = format!("{}, {}", run.class.name(), run.set_up.name());
-            Some((name, run.measured.value()?.0.responses()))
-        });
-        let series: Vec<(String, Vec<f64>)> = series.collect();
+        let series = of.filter_map(|run| Some((run.place_name(), run.measured.first()?.0.responses())));
         section.add_drawing(
             format!("jitter-{}", example.name),
-            format!("{}: share of requests answered within a time", example.name),
-            plots::distribution(example.name, "response time (s)", &series, true)?,
+            format!("{}: share of requests answered within a time, in the first run", example.name),
+            plots::distribution(example.name, "response time (s)", &series.collect::<Vec<_>>(), true),
         );
     }
     add_missing(&mut section, runs);
-    Ok(section)
-}
-
-/// Compares the variation natively and outsourced: by the standard deviations and, where that of the outsourced run is
-/// not smaller, by the range of nine in ten requests.
-fn steadiness_finding(run: &OutsourcingRun, network: NetworkProfile, native: &[f64], here: &[f64]) -> Option<String> {
-    let [on_robot, outsourced] = [native, here].map(standard_deviation);
-    let (on_robot, outsourced) = on_robot.zip(outsourced)?;
-    let most = |all: &[f64]| Some(quantile(all, 0.95)? - quantile(all, 0.05)?);
-    let less = outsourced < on_robot;
-    let why = match most(native).zip(most(here)) {
-        _ if less => String::new(),
-        Some((native, here)) if here < native => format!(
-            ": worse than hoped, and by few requests, as from 5 % to 95 % they differ by {} ms and on the robot by {} \
-             ms",
-            milliseconds(Some(here)),
-            milliseconds(Some(native))
-        ),
-        _ => ": worse than hoped".to_owned(),
-    };
-    Some(format!(
-        "{} by {}: response times {} outsourced (standard deviation {} ms) than on a robot of the class {} ({} \
-         ms){why}.",
-        run.example.name,
-        network.name(),
-        if less { "differ less" } else { "differ more" },
-        milliseconds(Some(outsourced)),
-        run.class.name(),
-        milliseconds(Some(on_robot))
-    ))
+    section
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::experiments::outsourcing::tests::test_run;
+    use crate::place::NetworkProfile;
     use crate::words::assert_tells;
 
     #[test]
@@ -109,28 +77,10 @@ mod tests {
             test_run(OutsourcingSetUp::Behind(NetworkProfile::Lan), &[0.1, 0.1]),
             test_run(OutsourcingSetUp::Behind(NetworkProfile::Wan), &[0.1, 0.9]),
         ];
-        let section = jitter(&runs).expect("a section");
-        let [lan, wan] = &section.findings[..] else {
-            panic!("{:?}", section.findings);
-        };
-        assert_tells(lan, "LAN: response times differ less");
-        assert_tells(wan, "response times differ more outsourced (standard deviation 566 ms) than");
-        assert!(wan.ends_with("(141 ms): worse than hoped."), "{wan}");
-    }
-
-    #[test]
-    fn few_slow_requests_are_told_as_such() {
-        let mut few = vec![0.1; 100];
-        few[99] = 9.0;
-        let runs = [
-            test_run(OutsourcingSetUp::Native, &[0.3, 0.5]),
-            test_run(OutsourcingSetUp::Behind(NetworkProfile::Wan), &few),
-        ];
-        let section = jitter(&runs).expect("a section");
-        let told = &section.findings[0];
-        assert!(
-            told.ends_with("by few requests, as from 5 % to 95 % they differ by 0.00 ms and on the robot by 180 ms."),
-            "{told}"
-        );
+        let section = jitter(&runs);
+        assert_tells(&section.findings[0], "LAN: response times differ less outsourced");
+        assert_tells(&section.findings[1], "differ more, worse than hoped, outsourced");
+        assert_tells(&section.findings[1], "(standard deviations 566 and 141 ms)");
+        assert_eq!(section.tables[0].rows[0][5..], ["400", "490", "498"]);
     }
 }

@@ -1,81 +1,65 @@
 //! Experiment 4: the parts of a frame's response time.
 
-use anyhow::Result;
-
 use super::{OutsourcingRun, add_missing};
 use crate::examples::LASER_SLAM;
 use crate::plots::{self, Bar};
-use crate::section::{MissingMeasurement, Section, Table};
-use crate::statistics::mean;
-use crate::trace::ComputationPhases;
-use crate::words::milliseconds;
+use crate::section::{About, Section, Table};
+use crate::trace::{PART_NAMES, Trace};
+use crate::words::{count, milliseconds};
+
+/// The experiment.
+pub const PHASES: About = About {
+    number: 4,
+    id: "phases",
+    title: "Where the time of one frame goes",
+    published: "Table II of the publication: SLAMBench's phases (acquisition, computation, rendering) of KinectFusion, \
+        native and outsourced.",
+    differs: &["The phases are those that laser_slam tells; what is left of the response time is transport: \
+        serialization, the network, the portal and waiting."],
+};
 
 /// Creates the section of experiment 4.
-pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
-    let mut section = Section::new(4, "phases", "Where the time of one frame goes");
-    section.published = "Table II of the publication: SLAMBench's phases (acquisition, computation, rendering) of \
-        KinectFusion, native and outsourced."
-        .to_owned();
-    section.differs = vec![
-        "The phases are those of laser_slam, as it tells them itself; what is left of the response time is transport: \
-         serialization, the network, the portal and waiting."
-            .to_owned(),
-    ];
-    let mut table = Table::new(
-        "Mean of all frames, milliseconds",
-        "robot | where | acquisition | computation | rendering | transport and waiting | response time",
-    );
+pub fn phases(runs: &[OutsourcingRun]) -> Section {
+    let mut section = PHASES.section();
+    let head = format!("robot | where | {} | response time", PART_NAMES.join(" | "));
+    let mut table = Table::new("Mean of all frames, milliseconds", &head);
     let mut bars = Vec::new();
-    for run in runs.iter().filter(|run| run.example.name == LASER_SLAM.name) {
-        let Some((trace, _)) = run.measured.value() else {
-            continue;
-        };
-        // All means are over the same requests: those whose parts are known.
-        let both = trace.requests.iter();
-        let both = both.filter_map(|one| Some((one.response?, one.phases?)));
-        let (responses, told): (Vec<f64>, Vec<ComputationPhases>) = both.unzip();
-        if told.is_empty() {
-            section.missing.push(MissingMeasurement {
-                what: format!("phases, {}, {}", run.class.name(), run.set_up.name()),
-                why: "the node told none".to_owned(),
-                next: "look at its topic laser_slam/timing".to_owned(),
-            });
+    let of_slam = || runs.iter().filter(|run| run.example.name == LASER_SLAM.name);
+    for run in of_slam().filter(|run| !run.measured.done.is_empty()) {
+        let figure = |find: &dyn Fn(&Trace) -> Option<f64>| run.measured.figure(|(trace, _)| find(trace));
+        let parts = [0, 1, 2, 3].map(|part| figure(&|trace| Some(trace.mean_parts()?[part])));
+        let whole = figure(&|trace| Some(trace.mean_parts()?.iter().sum()));
+        if whole.is_none() {
+            let next = "look at its topic laser_slam/timing";
+            section.add_missing(format!("phases, {}", run.place_name()), "the node told none", next);
             continue;
         }
-        let of = |part: fn(&ComputationPhases) -> f64| mean(&told.iter().map(part).collect::<Vec<f64>>());
-        let parts = [of(|one| one.acquisition), of(|one| one.computation), of(|one| one.rendering)];
-        let own: f64 = parts.iter().flatten().sum();
-        let whole = mean(&responses);
-        let rest = whole.map(|whole| whole - own);
-        let group = format!("{}, {}", run.class.name(), run.set_up.name());
-        let shares = [parts[1], rest].map(|part| Some(100.0 * part? / whole?));
-        if let [Some(computation), Some(transport)] = shares {
-            section.findings.push(format!(
-                "{group}: computation is {computation:.0} % of the response time, transport and waiting {transport:.0} \
-                 %."
-            ));
-        }
-        for (name, part) in
-            ["acquisition", "computation", "rendering", "transport"].into_iter().zip(parts.into_iter().chain([rest]))
-        {
-            bars.push(Bar {
-                group: group.clone(),
-                name: name.to_owned(),
-                value: part.unwrap_or(f64::NAN) * 1e3,
-                spread: None,
-            });
-        }
-        let cells = parts.into_iter().chain([rest, whole]).map(milliseconds);
-        table.push([run.class.name().to_owned(), run.set_up.name().to_owned()].into_iter().chain(cells));
+        let [computation, transport] = [1, 3].map(|part| {
+            figure(&|trace| {
+                let parts = trace.mean_parts()?;
+                Some(100.0 * parts[part] / parts.iter().sum::<f64>())
+            })
+        });
+        section.findings.push(format!(
+            "{}: computation is {} % of the response time, transport and waiting {} %.",
+            run.place_name(),
+            count(computation),
+            count(transport)
+        ));
+        bars.extend(PART_NAMES.iter().zip(parts).filter_map(|(name, part)| {
+            let part = part?;
+            let spread = Some((part.low * 1e3, part.high * 1e3));
+            Some(Bar { spread, ..Bar::new(run.place_name(), *name, part.median * 1e3) })
+        }));
+        let mut row = run.labels()[1..].iter().map(|label| (*label).to_owned()).collect::<Vec<_>>();
+        row.extend(parts.into_iter().chain([whole]).map(milliseconds));
+        table.push(row);
     }
     section.tables.push(table);
-    section.add_drawing(
-        "phases",
-        "Parts of one frame's response time",
-        plots::bars("laser_slam", "time (ms)", &bars, false)?,
-    );
-    add_missing(&mut section, &runs.iter().filter(|run| run.example.name == LASER_SLAM.name).collect::<Vec<_>>());
-    Ok(section)
+    let drawing = plots::bars("laser_slam", "time (ms)", &bars, false);
+    section.add_drawing("phases", "Parts of one frame's response time", drawing);
+    add_missing(&mut section, of_slam());
+    section
 }
 
 #[cfg(test)]
@@ -86,7 +70,7 @@ mod tests {
 
     #[test]
     fn what_phases_do_not_tell_is_transport() {
-        let section = phases(&[test_run(OutsourcingSetUp::Native, &[1.0, 1.0])]).expect("a section");
-        assert_eq!(section.tables[0].rows[0][2..], ["100", "500", "200", "200", "1000"].map(str::to_owned));
+        let section = phases(&[test_run(OutsourcingSetUp::Native, &[1.0, 1.0])]);
+        assert_eq!(section.tables[0].rows[0][2..], ["100", "500", "200", "200", "1000"]);
     }
 }

@@ -22,18 +22,14 @@ pub(super) struct TimeCounters {
 /// Cores used during a period.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct CoreUsage {
-    /// By the whole machine.
     pub(super) machine: f64,
-    /// By the daemon, which includes the portal.
     pub(super) daemon: f64,
-    /// By the servants.
     pub(super) servants: f64,
     /// By the robots, whose process also makes the measurements.
     pub(super) robots: f64,
 }
 
 impl CoreUsage {
-    /// Cores used by the processing of requests.
     pub(super) fn request_cores(&self) -> f64 {
         self.daemon + self.servants + self.robots
     }

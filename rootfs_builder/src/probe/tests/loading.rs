@@ -30,7 +30,7 @@ async fn run_probe(
     probe(&bus, &registry, &definitions, &options, std::future::pending()).await
 }
 
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 #[tokio::test]
 async fn a_container_loads_its_nodes_before_they_are_looked_at() {
@@ -44,7 +44,7 @@ async fn a_container_loads_its_nodes_before_they_are_looked_at() {
         ..component("talk::Talker", "see")
     };
     let components = vec![first, component("talk::Talker", "")];
-    run_probe(&system, components, LONG).await.expect("found");
+    run_probe(&system, components, PATIENCE).await.expect("found");
     assert_eq!(container.names(), ["/front/see", "/talker"]);
     let asked = container.loaded.lock().asked[0].clone();
     for (field, expected) in [
@@ -68,7 +68,7 @@ async fn what_is_not_loaded_is_told_with_the_containers_words() {
     let container = MemoryContainer::start(&system, "/box").await;
     let components =
         vec![component("talk::Talker", "see"), component("talk::Walker", "go"), component("talk::Talker", "late")];
-    let error = run_probe(&system, components, LONG).await.expect_err("refused");
+    let error = run_probe(&system, components, PATIENCE).await.expect_err("refused");
     assert_eq!(
         error.to_string(),
         "the component container /box does not load /go (talk::Walker of package talk): Failed to find class with the \

@@ -37,9 +37,12 @@ enum ServiceCallError {
     Begin(#[from] BeginCallError),
     #[error(transparent)]
     NotGranted(#[from] NotGrantedError),
-    /// The service does not answer, or answers that it failed.
+    /// The service answers that it failed, or cannot be called.
     #[error(transparent)]
-    Bus(#[from] BusError),
+    Bus(BusError),
+    /// The text is rosbridge_suite's: clients compare it.
+    #[error("Timeout exceeded while waiting for service response")]
+    Timeout(#[source] BusError),
     #[error(transparent)]
     Definition(#[from] DefinitionError),
     #[error(transparent)]
@@ -59,6 +62,15 @@ enum ServiceCallError {
     NoRoom(#[from] Exceeded),
     #[error(transparent)]
     Own(#[from] OwnServiceError),
+}
+
+impl From<BusError> for ServiceCallError {
+    fn from(error: BusError) -> Self {
+        match error {
+            BusError::Timeout { .. } => Self::Timeout(error),
+            other => Self::Bus(other),
+        }
+    }
 }
 
 /// A service whose server has another definition of its type.

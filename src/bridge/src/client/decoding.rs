@@ -8,7 +8,7 @@ use ros::schema::MessageType;
 use rosbridge::{Compression, Format, Payload};
 
 /// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
-const SLICED: usize = 16 * 1024;
+const MIN_SLICE: usize = 16 * 1024;
 
 /// Reasons why a payload is not a message of its type.
 #[derive(Debug, thiserror::Error)]
@@ -47,7 +47,7 @@ pub(super) fn decode(
         let raw = read_raw(payload)?;
         codec::validate(message_type, &raw).map_err(Box::new)?;
         let bytes = match (&raw, source) {
-            (Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => source.slice_ref(slice),
+            (Cow::Borrowed(slice), Some(source)) if slice.len() >= MIN_SLICE => source.slice_ref(slice),
             _ => Bytes::from(raw.into_owned()),
         };
         return Ok(DecodedPayload { bytes, dropped_seq: false });

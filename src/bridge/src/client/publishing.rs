@@ -20,7 +20,7 @@ use crate::tf;
 use crate::topic_publisher::{PublisherEvents, TopicPublisher};
 
 /// Maximum number of messages on one topic that wait until its type is known.
-const MAX_UNTYPED: usize = 64;
+const MAX_UNTYPED_MESSAGES: usize = 64;
 /// Maximum bytes of all such messages of one client; a single message may be larger.
 const MAX_UNTYPED_BYTES: usize = 16 << 20;
 
@@ -139,9 +139,11 @@ impl BridgeClient {
         let mut topic_publishers = self.topic_publishers.lock();
         topic_publishers.told.remove(&*topic);
         let known = topic_publishers.open.get_mut(&*topic);
-        // Without an id, all advertisements of the client are meant.
+        // Without an id, all advertisements of the client are meant. A topic that was only published on has none, and
+        // ends under the id of its messages.
         let left = known.map(|known| match reply.id {
             None => Some(0),
+            Some(_) if known.ids.is_empty() => Some(0),
             Some(_) => known.ids.remove(&reply.id).then_some(known.ids.len()),
         });
         let (gone, warning) = match left {
@@ -321,7 +323,7 @@ impl BridgeClient {
             return Err(PublishError::TooManyUntypedBytes { topic: topic.to_owned(), waiting: held });
         }
         if let Some(others) = topic_publishers.untyped.get_mut(topic) {
-            if others.len() >= MAX_UNTYPED {
+            if others.len() >= MAX_UNTYPED_MESSAGES {
                 return Err(PublishError::TooManyUntyped(topic.to_owned()));
             }
             others.push(waiting);

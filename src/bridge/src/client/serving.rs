@@ -60,6 +60,12 @@ impl ClientServices {
         self.served.keys().map(String::as_str)
     }
 
+    /// Returns an id for the client's next call, in rosbridge_suite's form: its numbers begin at 1 for each client.
+    fn next_request_id(&mut self, service: &str) -> String {
+        self.requested += 1;
+        format!("service_request:{service}:{}", self.requested)
+    }
+
     /// Returns a receiver that tells whether a service of this client is registered.
     pub(super) fn registration(&self, service: &str) -> Option<watch::Receiver<bool>> {
         Some(self.served.get(service)?.registered.clone())
@@ -82,7 +88,7 @@ impl ServiceHandler for CallHandler {
         let gone = || FailureReason::new(format!("the client that serves {} is gone", self.service));
         let client = self.client.upgrade().ok_or_else(gone)?;
         client.shared.metrics.calls_served.add(1);
-        let id = format!("service_request:{}:{}", self.service, client.shared.next_number());
+        let id = client.services.lock().next_request_id(&self.service);
         let frame = self.frame(&client, &id, &request);
         let frame = frame.map_err(|error| FailureReason::new(error.to_string()))?;
         let (answer, answered) = oneshot::channel();
@@ -109,7 +115,6 @@ impl CallHandler {
         let mut out = Vec::with_capacity(256 + request.len());
         let mut writer = Writer::op(&mut out, format, "call_service", Some(&Id::from(id)));
         writer.text("service", &self.written);
-        writer.text("type", &self.def.name);
         if self.compression == Compression::CborRaw {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, request);

@@ -11,7 +11,7 @@ use rosbridge::{Compression, Format, StatusLevel};
 use tokio::io::{AsyncRead, AsyncWrite};
 use ws::frame;
 
-use super::{BridgeConnection, MOVED, SOCKET_FULL, StopReason};
+use super::{BridgeConnection, SOCKET_FULL, StopReason, TURN_BYTES};
 use crate::cut::Fragmenter;
 use crate::outbox::{ControlMessage, Outgoing, TopicKey};
 use crate::sample::{EncodedFrame, SampleError, TopicSample};
@@ -20,7 +20,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     /// Moves queued frames into the socket. Ready when none is left, pending when the socket accepts no more.
     pub(super) fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), StopReason>> {
         loop {
-            while self.socket.bytes_queued() < SOCKET_FULL && self.moved < MOVED {
+            while self.socket.bytes_queued() < SOCKET_FULL && self.moved < TURN_BYTES {
                 let next = self.next_frame(now).map_err(|full| StopReason::Close {
                     code: 1013,
                     reason: format!("a fragment cannot be sent: {full}"),

@@ -78,7 +78,7 @@ const TEXTS: &[(&str, &str)] = &[
 ];
 
 /// Services of ROS 1 only.
-const OF_ONE: &[(&str, &str)] = &[
+const ROS1_SERVICES: &[(&str, &str)] = &[
     ("DeleteParam", "string name\n---\n"),
     ("GetParam", "string name\nstring default\n---\nstring value\n"),
     ("GetTime", "---\ntime time\n"),
@@ -113,10 +113,10 @@ pub(super) fn type_name(version: RosVersion, srv: &str) -> String {
 
 /// Returns rosapi's own definitions.
 pub(super) fn registry(version: RosVersion) -> &'static Registry {
-    static ONE: OnceLock<Registry> = OnceLock::new();
+    static ROS1_REGISTRY: OnceLock<Registry> = OnceLock::new();
     static TWO: OnceLock<Registry> = OnceLock::new();
     let (registry, own) = match version {
-        RosVersion::One => (&ONE, OF_ONE),
+        RosVersion::One => (&ROS1_REGISTRY, ROS1_SERVICES),
         RosVersion::Two => (&TWO, OF_TWO),
     };
     registry.get_or_init(|| {
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn every_service_has_its_definition() {
-        for (version, own) in [(RosVersion::One, OF_ONE), (RosVersion::Two, OF_TWO)] {
+        for (version, own) in [(RosVersion::One, ROS1_SERVICES), (RosVersion::Two, OF_TWO)] {
             assert_eq!(SERVICES.len(), TEXTS.len() + own.len());
             for (_, srv) in SERVICES {
                 let name = type_name(version, srv);

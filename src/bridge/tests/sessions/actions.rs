@@ -37,8 +37,8 @@ async fn a_goal_goes_with_feedback_to_its_result() {
         let asked = server.json().await;
         assert_eq!(asked["op"], "send_action_goal");
         assert_eq!(
-            (&asked["action"], &asked["args"], &asked["feedback"]),
-            (&json!("/count"), &json!({"to": 3}), &json!(true))
+            (&asked["action"], &asked["action_type"], &asked["args"], &asked["feedback"]),
+            (&json!("/count"), &json!(COUNT), &json!({"to": 3}), &json!(true))
         );
         let id = &asked["id"];
         server.send(json!({"op": "action_feedback", "id": id, "action": "/count", "values": {"at": 2}})).await;

@@ -35,6 +35,22 @@ async fn rubbish_is_answered_and_the_connection_lives() {
 }
 
 #[tokio::test]
+async fn json_is_understood_in_binary_frames_and_answered_in_text() {
+    let world = World::new().await;
+    let mut client = world.client().await;
+    for op in [
+        json!({"op": "subscribe", "topic": "/x", "type": "std_msgs/Int32"}),
+        json!({"op": "advertise", "topic": "/x", "type": "std_msgs/Int32"}),
+        json!({"op": "publish", "topic": "/x", "msg": {"data": 1}}),
+    ] {
+        client.send_binary(op.to_string().into_bytes()).await;
+    }
+    assert_eq!(client.json().await["msg"], json!({"data": 1}));
+    client.send_binary(b"{}".to_vec()).await;
+    assert!(client.refusal().await.starts_with("field \"op\" is missing"));
+}
+
+#[tokio::test]
 async fn wrapped_messages_are_unwrapped_but_not_for_ever() {
     let world = World::new().await;
     let mut client = world.client().await;

@@ -238,6 +238,14 @@ async fn a_topic_stays_until_its_last_advertisement_is_taken_back() {
     world.wait_for_graph(|graph| !graph.topics["/text"].publishers.is_empty()).await;
     client.send(json!({"op": "unadvertise", "topic": "/text"})).await;
     world.wait_for_graph(|graph| graph.topics["/text"].publishers.is_empty()).await;
+
+    // A message advertises its topic, under its own id.
+    let message = json!({"op": "publish", "id": "one", "topic": "/text", "msg": {"data": "x"}});
+    client.send(message).await;
+    with_timeout(heard.messages.recv()).await.unwrap();
+    client.send(unadvertise("one")).await;
+    world.wait_for_graph(|graph| graph.topics["/text"].publishers.is_empty()).await;
+    client.sync().await;
 }
 
 #[tokio::test]

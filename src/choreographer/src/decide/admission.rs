@@ -2,7 +2,7 @@
 //! memory, and never more is promised than there is.
 //!
 //! Waiting robots are served in the order of their priorities, and within a priority in order of arrival. A robot that
-//! was overtaken [`OVERTAKEN`] times goes before all later ones, whatever their priority (bounded overtaking, as
+//! was overtaken [`MAX_OVERTAKES`] times goes before all later ones, whatever their priority (bounded overtaking, as
 //! required of fair locks), so none starves. The first in the queue blocks those behind it, or large servants would
 //! starve. Pushes come after all robots.
 
@@ -12,7 +12,7 @@ use super::Amount;
 use super::capacity::Shortage;
 
 /// Maximum number of times that a waiting request may be overtaken.
-pub const OVERTAKEN: u32 = 8;
+pub const MAX_OVERTAKES: u32 = 8;
 
 /// The error of a servant that is not admitted, or not promised more.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -162,7 +162,7 @@ impl Waiter {
 
     /// Returns the sort key in the queue: smaller ranks go first; within a rank, those who came first.
     fn rank(&self) -> (bool, bool, std::cmp::Reverse<i32>) {
-        let patient = self.overtaken < OVERTAKEN;
+        let patient = self.overtaken < MAX_OVERTAKES;
         let priority = if patient { self.ask.priority } else { 0 };
         (!self.is_robot(), patient, std::cmp::Reverse(priority))
     }
@@ -395,7 +395,7 @@ impl AdmissionLedger {
             if waiter.ask.wanted.fits(self.free()) {
                 return Some(waiter.ticket);
             }
-            if waiter.is_robot() || waiter.overtaken >= OVERTAKEN {
+            if waiter.is_robot() || waiter.overtaken >= MAX_OVERTAKES {
                 return None;
             }
         }
@@ -524,7 +524,7 @@ mod tests {
     fn nobody_is_overtaken_for_ever() {
         let mut book = machine(64, 2.0);
         assert_eq!(ask(&mut book, 0, 1.0, Robot), AdmissionVerdict::Waits);
-        for ticket in 1..=u64::from(OVERTAKEN) + 3 {
+        for ticket in 1..=u64::from(MAX_OVERTAKES) + 3 {
             assert_eq!(ask_with_priority(&mut book, ticket, 1.0, Robot, 9), AdmissionVerdict::Waits);
         }
         let mut before = Vec::new();
@@ -535,13 +535,13 @@ mod tests {
             }
             before.extend(admitted);
         }
-        assert_eq!(before, (1..=u64::from(OVERTAKEN)).collect::<Vec<_>>());
+        assert_eq!(before, (1..=u64::from(MAX_OVERTAKES)).collect::<Vec<_>>());
         // The last request that overtakes it lets it in.
         let mut book = machine(64, 2.0);
         assert_eq!(ask_with_priority(&mut book, 0, 0.1, Robot, 0), AdmissionVerdict::Waits);
         assert_eq!(ask_with_priority(&mut book, 1, 1.0, Robot, 5), AdmissionVerdict::Waits);
         assert!(book.release(cores(0.4)).is_empty(), "the first one blocks");
-        let last = u64::from(OVERTAKEN) + 1;
+        let last = u64::from(MAX_OVERTAKES) + 1;
         for ticket in 2..last {
             assert_eq!(ask_with_priority(&mut book, ticket, 0.01, Robot, 9), AdmissionVerdict::Admitted);
         }
@@ -561,9 +561,9 @@ mod tests {
         // Two wait, which is the maximum: a new one is refused, and one that had a position is not.
         let full = AdmissionVerdict::Refused(AdmissionError::QueueFull { waiting: 2 });
         assert_eq!(ask(&mut book, 4, 1.0, Robot), full);
-        let (verdict, others) = book.request_again(1, AdmissionRequest::robot(cores(1.0), 0), OVERTAKEN);
+        let (verdict, others) = book.request_again(1, AdmissionRequest::robot(cores(1.0), 0), MAX_OVERTAKES);
         assert_eq!((verdict, others), (AdmissionVerdict::Waits, vec![]));
-        assert_eq!(book.overtaken_count(1), Some(OVERTAKEN));
+        assert_eq!(book.overtaken_count(1), Some(MAX_OVERTAKES));
         let order: Vec<Ticket> = book.queue_positions().map(|(ticket, _)| ticket).collect();
         assert_eq!(order, [1, 2, 3]);
         assert_eq!(tickets(book.release(cores(2.0))), [1, 2]);

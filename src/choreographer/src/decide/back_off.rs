@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(300);
 /// Longest pause if several robots share it, because one of them may have caused the failure with its messages.
-const LONGEST_SHARED: Duration = Duration::from_secs(4);
+const MAX_SHARED_PAUSE: Duration = Duration::from_secs(4);
 /// Time after which a ready servant, or a running node, counts as recovered from earlier failures.
-pub const RECOVERED: Duration = Duration::from_secs(60);
+pub const RECOVERY_TIME: Duration = Duration::from_secs(60);
 /// Time after a failure's pause until the failure is forgotten.
-const FORGOTTEN: Duration = Duration::from_secs(600);
+const FAILURE_EXPIRY: Duration = Duration::from_secs(600);
 
 /// Consecutive failures of one robot's servants of one revision.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -36,12 +36,12 @@ pub fn after_failure(
     now: Instant,
 ) -> FailureStreak {
     let counts = |before: &&FailureStreak| {
-        let recovered = ready_for.is_some_and(|time| time >= RECOVERED);
+        let recovered = ready_for.is_some_and(|time| time >= RECOVERY_TIME);
         before.revision == revision && !recovered && !is_forgotten(before, now)
     };
     let failures = before.filter(counts).map_or(1, |before| before.failures.saturating_add(1));
     // A servant that was never ready has met no robot.
-    let longest = if shared && ready_for.is_some() { LONGEST_SHARED } else { LONGEST_PAUSE };
+    let longest = if shared && ready_for.is_some() { MAX_SHARED_PAUSE } else { LONGEST_PAUSE };
     let pause = match failures {
         1 => Duration::ZERO,
         n => double_pause(FIRST_PAUSE, n - 2, longest),
@@ -63,7 +63,7 @@ pub fn remaining_pause(of: &FailureStreak, revision: u64, now: Instant) -> Optio
 
 /// Returns true if the failures are too long ago to count.
 pub fn is_forgotten(of: &FailureStreak, now: Instant) -> bool {
-    now >= of.again + FORGOTTEN
+    now >= of.again + FAILURE_EXPIRY
 }
 
 /// Returns the remaining seconds, rounded up, so that a retry after them is not too early.
@@ -91,11 +91,11 @@ mod tests {
         let none = Duration::ZERO;
         let pauses: Vec<u64> = (0..12).map(|_| fails(1, None, none)).collect();
         assert_eq!(pauses, [0, 1, 2, 4, 8, 16, 32, 64, 128, 256, 300, 300]);
-        assert_eq!(fails(1, Some(RECOVERED / 2), none), 300, "not for long");
-        assert_eq!(fails(1, Some(RECOVERED), none), 0, "it had recovered");
+        assert_eq!(fails(1, Some(RECOVERY_TIME / 2), none), 300, "not for long");
+        assert_eq!(fails(1, Some(RECOVERY_TIME), none), 0, "it had recovered");
         assert_eq!(fails(1, None, none), 1);
         assert_eq!(fails(2, None, none), 0, "another revision");
-        assert_eq!(fails(2, None, FORGOTTEN), 1);
+        assert_eq!(fails(2, None, FAILURE_EXPIRY), 1);
         assert_eq!(fails(2, None, none), 0, "long ago");
     }
 
@@ -110,7 +110,7 @@ mod tests {
             }
             before.expect("it failed").again - now
         };
-        assert_eq!(failing(Some(Duration::ZERO)), LONGEST_SHARED);
+        assert_eq!(failing(Some(Duration::ZERO)), MAX_SHARED_PAUSE);
         assert_eq!(failing(None), LONGEST_PAUSE, "no robot has done that");
     }
 

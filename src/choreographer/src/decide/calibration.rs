@@ -17,7 +17,7 @@ const PATIENCE: usize = 2;
 /// Minimum number of answers for a meaningful 95th percentile.
 pub(crate) const FEWEST: usize = 10;
 /// Minimum fraction of the requests that must be answered, and of the recording's pace that must be kept.
-const ENOUGH: f64 = 0.95;
+const MIN_ANSWERED_SHARE: f64 = 0.95;
 /// Margin of the proposed memory above the peak, in percent; the peak is only sampled.
 pub(crate) const MARGIN: u64 = 25;
 /// Minimum margin, in bytes.
@@ -90,7 +90,7 @@ fn is_better(new: &TimeSpread, best: &TimeSpread) -> bool {
 
 /// Returns true if enough of the point's requests were answered.
 fn has_enough_answers(point: &Point) -> bool {
-    point.answered >= FEWEST && point.answered as f64 >= point.requests as f64 * ENOUGH
+    point.answered >= FEWEST && point.answered as f64 >= point.requests as f64 * MIN_ANSWERED_SHARE
 }
 
 /// Returns the rows that follow from the measurements, fewest cores first. Each is faster than all cheaper ones. Limits
@@ -136,7 +136,7 @@ pub(crate) fn propose_rows(
 }
 
 fn keeps_pace(point: &Point, pace: Option<f64>) -> bool {
-    pace.is_none_or(|pace| point.rate >= pace * ENOUGH)
+    pace.is_none_or(|pace| point.rate >= pace * MIN_ANSWERED_SHARE)
 }
 
 /// Returns the memory for a servant with this peak: [`MARGIN`] percent more, in whole MiB.

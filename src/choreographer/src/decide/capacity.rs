@@ -6,9 +6,9 @@ use super::{Amount, ServantFacts, StopOrder};
 /// Capacity that would have to be freed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Shortage {
-    /// For all waiting requests.
+    /// Amount missing for all waiting requests.
     pub all: Amount,
-    /// For the first waiting robot.
+    /// Amount missing for the first waiting robot.
     pub first_robot: Amount,
 }
 

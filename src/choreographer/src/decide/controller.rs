@@ -24,18 +24,18 @@ use std::time::{Duration, Instant};
 use super::shares::{Claim, fill_shares};
 
 /// A servant becomes near when its requests take this fraction of the accepted time, …
-const NEAR: f64 = 0.85;
+const NEAR_SHARE: f64 = 0.85;
 /// … and stops being near below this fraction.
 const FAR: f64 = 0.7;
 /// Minimum fraction of the requests' time spent in the cloud for cores to help.
 const OURS: f64 = 0.2;
 /// If no request is measured: fraction of the time in which the servant was runnable but throttled, or waited for cores
 /// used by others.
-const HINDERED: f64 = 0.1;
+const HINDERED_SHARE: f64 = 0.1;
 /// Time after which the measures for a servant that is no longer near are reverted.
 pub const HOLD: Duration = Duration::from_secs(5);
 /// Maximum number of doublings of [`HOLD`], one for each time that the servant was near again soon after.
-const DOUBLED: u32 = 6;
+const MAX_HOLD_DOUBLINGS: u32 = 6;
 /// "Soon" means within this multiple of the time waited before.
 const SOON: u32 = 4;
 /// Divisor: a near servant gets this fraction more at each step, at least [`STEP`].
@@ -43,7 +43,7 @@ const GROWTH: u64 = 4;
 /// Minimum step, in thousandths of a core.
 const STEP: u64 = 100;
 /// Minimum for any servant, in thousandths of a core, so that it still answers, if slowly.
-const LEAST: u64 = 50;
+const MIN_QUOTA: u64 = 50;
 /// Divisor of the headroom: usage may rise by a quarter in the next moment.
 const HEADROOM: u64 = 4;
 /// Divisor: changes smaller than this fraction are skipped, …
@@ -71,7 +71,7 @@ impl ResponseGoal {
 /// 95th percentiles of recent response times, in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredTimes {
-    /// From request to answer.
+    /// Time from request to answer.
     pub total: f64,
     /// The part of it spent queueing and computing in the cloud.
     pub cloud: f64,
@@ -169,11 +169,11 @@ impl ControlFacts<'_> {
         let was = self.history.near.is_some();
         match self.measured.zip(goal.upper_bound()) {
             Some((MeasuredTimes { total, cloud }, bound)) => {
-                let threshold = if was { FAR } else { NEAR };
+                let threshold = if was { FAR } else { NEAR_SHARE };
                 total >= bound * threshold && cloud >= total * OURS
             }
             None => {
-                let threshold = if was { HINDERED / 2.0 } else { HINDERED };
+                let threshold = if was { HINDERED_SHARE / 2.0 } else { HINDERED_SHARE };
                 self.throttled >= threshold || self.waited >= threshold
             }
         }
@@ -182,15 +182,15 @@ impl ControlFacts<'_> {
     /// Returns the estimated need for cores, based on usage; its whole quota if the usage is unknown.
     fn estimated_need(&self) -> u64 {
         match self.used {
-            Some(used) => used + used / HEADROOM + LEAST,
+            Some(used) => used + used / HEADROOM + MIN_QUOTA,
             None => self.quota,
         }
     }
 
     /// Returns true if it would use more cores.
     fn is_held_up(&self) -> bool {
-        self.throttled >= HINDERED
-            || self.waited >= HINDERED
+        self.throttled >= HINDERED_SHARE
+            || self.waited >= HINDERED_SHARE
             || (self.used.is_some() && self.estimated_need() >= self.quota)
     }
 
@@ -201,14 +201,14 @@ impl ControlFacts<'_> {
             _ if self.estimated_need() <= less => true,
             (Some(MeasuredTimes { total, cloud }), Some(bound)) => {
                 let longer = cloud * self.quota as f64 / less.max(1) as f64;
-                total - cloud + longer < bound * NEAR
+                total - cloud + longer < bound * NEAR_SHARE
             }
             (_, bound) => bound.is_none(),
         }
     }
 
     fn floor(&self) -> u64 {
-        self.promised.max(LEAST)
+        self.promised.max(MIN_QUOTA)
     }
 }
 
@@ -243,7 +243,7 @@ fn update_history(one: &ControlFacts<'_>, now: Instant) -> ControlHistory {
     if one.is_near() {
         if history.near.is_none() {
             let soon = elapsed_since(history.over, now) < hold * SOON;
-            history.again = if soon { DOUBLED.min(history.again + 1) } else { 0 };
+            history.again = if soon { MAX_HOLD_DOUBLINGS.min(history.again + 1) } else { 0 };
         }
         history.near = Some(now);
     } else if history.near.is_some() && elapsed_since(history.near, now) >= hold {

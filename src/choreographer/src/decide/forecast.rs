@@ -15,9 +15,9 @@ const LEVEL: f64 = 0.5;
 /// Weight of the last change of the level in the trend.
 const TREND: f64 = 0.1;
 /// Number of intervals without an arrival after which nothing is expected any more.
-const FORGOTTEN: u32 = 30;
+const MAX_EMPTY_INTERVALS: u32 = 30;
 /// Maximum number of containers, whatever the arrivals.
-const MOST: usize = 64;
+const MAX_CONTAINERS: usize = 64;
 
 /// Arrival statistics of one service's robots.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,7 +54,7 @@ impl Arrivals {
         let over = now.saturating_duration_since(of.begun).as_secs() / INTERVAL.as_secs();
         let over = u32::try_from(over).unwrap_or(u32::MAX);
         of.begun += INTERVAL * over;
-        if over > FORGOTTEN {
+        if over > MAX_EMPTY_INTERVALS {
             return Arrivals::new(of.begun);
         }
         for _ in 0..over {
@@ -79,7 +79,7 @@ pub fn erlang_b(containers: usize, offered: f64) -> f64 {
 
 /// Returns the fewest containers with which at most `share` of the arrivals find none.
 pub fn containers_needed(offered: f64, share: f64) -> usize {
-    (0..MOST).find(|n| erlang_b(*n, offered) <= share).unwrap_or(MOST)
+    (0..MAX_CONTAINERS).find(|n| erlang_b(*n, offered) <= share).unwrap_or(MAX_CONTAINERS)
 }
 
 #[cfg(test)]
@@ -117,7 +117,7 @@ mod tests {
         let mut burst = Arrivals::new(begun);
         (0..9).for_each(|_| burst.record_arrival(begun));
         assert!((burst.expected_rate(begun) - 0.9).abs() < 1e-9, "at once");
-        let later = begun + INTERVAL * (FORGOTTEN + 1);
+        let later = begun + INTERVAL * (MAX_EMPTY_INTERVALS + 1);
         assert_eq!(burst.expected_rate(later), 0.0);
     }
 
@@ -134,7 +134,7 @@ mod tests {
         assert_eq!(containers_needed(0.0, 1.0), 0);
         assert_eq!(containers_needed(1.0, 0.2), 2);
         assert_eq!(containers_needed(5.0, 0.02), 10);
-        assert_eq!(containers_needed(1e9, 0.02), MOST);
+        assert_eq!(containers_needed(1e9, 0.02), MAX_CONTAINERS);
     }
 
     proptest! {
@@ -149,7 +149,7 @@ mod tests {
             prop_assert!(busy >= 0.0 && busy.is_finite());
             prop_assert!(busy <= f64::from(most) * 2.0, "a trend is no explosion: {busy}");
             counts.extend(std::iter::repeat_n(0, quiet as usize));
-            if quiet > FORGOTTEN {
+            if quiet > MAX_EMPTY_INTERVALS {
                 prop_assert_eq!(forecast_after(&counts), 0.0);
             }
         }
@@ -164,7 +164,7 @@ mod tests {
             prop_assert!(erlang_b(containers + 1, offered) <= erlang_b(containers, offered));
             let need = super::containers_needed(offered, share);
             prop_assert!(super::containers_needed(offered + more, share) >= need);
-            prop_assert!(need == MOST || erlang_b(need, offered) <= share);
+            prop_assert!(need == MAX_CONTAINERS || erlang_b(need, offered) <= share);
             prop_assert!(need == 0 || erlang_b(need - 1, offered) > share, "one too many");
         }
     }

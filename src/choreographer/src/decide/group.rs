@@ -18,17 +18,17 @@
 use std::time::{Duration, Instant};
 
 /// Requests per servant above which one more is started.
-const MANY: f64 = 1.5;
+const GROW_LOAD: f64 = 1.5;
 /// Requests per servant above which one more is started if answers are late.
 const LATE: f64 = 1.0;
 /// Requests per remaining servant below which one retires.
-const FEW: f64 = 0.7;
+const SHRINK_LOAD: f64 = 0.7;
 /// Time for which the load must be high.
 const STEADY: Duration = Duration::from_secs(1);
 /// Pause after a servant could not be started.
 const PAUSE: Duration = Duration::from_secs(5);
 /// Number of places in a group that are kept for robots that left and may come back.
-pub(crate) const LEFT: usize = 256;
+pub(crate) const MAX_FORMER_ROBOTS: usize = 256;
 
 /// Snapshot of a group.
 #[derive(Debug, Clone, Copy)]
@@ -93,8 +93,8 @@ pub(crate) fn decide_group(facts: &GroupFacts, since: LoadSince, now: Instant) -
     }
     let servants = facts.ready as f64;
     let late = facts.time.filter(|(takes, may)| takes > may && facts.requests > LATE * servants);
-    let many = facts.requests > MANY * servants || late.is_some();
-    let few = facts.requests < FEW * (servants - 1.0);
+    let many = facts.requests > GROW_LOAD * servants || late.is_some();
+    let few = facts.requests < SHRINK_LOAD * (servants - 1.0);
     let since = LoadSince { many: many.then(|| since.many.unwrap_or(now)), few: few.then(|| since.few.unwrap_or(now)) };
     let has_been = |since: Option<Instant>, long: Duration| since.is_some_and(|at| now >= at + long);
     if has_been(since.many, STEADY) && there < most && (facts.retiring > 0 || !rests) {
@@ -120,7 +120,7 @@ pub(crate) fn decide_group(facts: &GroupFacts, since: LoadSince, now: Instant) -
 /// themselves new names.
 pub(crate) fn expired_places(mut left: Vec<(u64, &str)>) -> Vec<&str> {
     left.sort_unstable();
-    left.truncate(left.len().saturating_sub(LEFT));
+    left.truncate(left.len().saturating_sub(MAX_FORMER_ROBOTS));
     left.into_iter().map(|(_, id)| id).collect()
 }
 
@@ -217,15 +217,15 @@ mod tests {
 
     #[test]
     fn places_that_were_left_first_are_given_up_first() {
-        let ids: Vec<String> = (0..LEFT + 2).map(|number| format!("s{number}")).collect();
+        let ids: Vec<String> = (0..MAX_FORMER_ROBOTS + 2).map(|number| format!("s{number}")).collect();
         // Not in the order in which they were left.
         let left = |count: usize| {
             let left = ids.iter().take(count).rev().enumerate();
             left.map(|(until, id)| (until as u64, id.as_str())).collect()
         };
-        assert_eq!(expired_places(left(LEFT)), Vec::<&str>::new());
-        let last = [&*ids[LEFT + 1], &*ids[LEFT]];
-        assert_eq!(expired_places(left(LEFT + 2)), last);
+        assert_eq!(expired_places(left(MAX_FORMER_ROBOTS)), Vec::<&str>::new());
+        let last = [&*ids[MAX_FORMER_ROBOTS + 1], &*ids[MAX_FORMER_ROBOTS]];
+        assert_eq!(expired_places(left(MAX_FORMER_ROBOTS + 2)), last);
     }
 
     proptest! {

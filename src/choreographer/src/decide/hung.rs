@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 /// Minimum number of unanswered inputs for a sign of trouble: a node need not answer each.
 const INPUTS: u64 = 3;
 /// Minimum time after which a node counts as hung, however short its T_max.
-const LEAST: Duration = Duration::from_secs(1);
+const MIN_SILENCE: Duration = Duration::from_secs(1);
 
 /// Cumulative messages to and from nodes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -80,7 +80,7 @@ pub fn observe_flow(
         return (watched, None);
     }
     let since = now - *watched.since.get_or_insert(now);
-    let hangs = !watched.told && inputs >= INPUTS && since >= patience.max(LEAST);
+    let hangs = !watched.told && inputs >= INPUTS && since >= patience.max(MIN_SILENCE);
     watched.told |= hangs;
     (watched, hangs.then_some(HungNodes { inputs, since }))
 }
@@ -128,7 +128,7 @@ mod tests {
         let flow = |inputs| Flow { inputs, outputs: 1, starts: 0 };
         let (watched, _) = observe_flow(None, flow(1), Duration::ZERO, begun);
         let (watched, _) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun);
-        let (_, hung) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun + LEAST / 2);
+        let (_, hung) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun + MIN_SILENCE / 2);
         assert_eq!(hung, None, "not for so short a time");
     }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 /// Time without changes after which the missing part of an interface is considered permanent: for an adopted servant,
 /// whose nodes may have been told to remove it, and for a revision that has kept robots waiting in vain.
-pub const SETTLED: Duration = Duration::from_secs(5);
+pub const SETTLE_TIME: Duration = Duration::from_secs(5);
 
 /// Stage of a servant's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -104,7 +104,7 @@ pub fn readiness(of: &InterfaceStatus<'_>, now: Instant) -> Readiness {
         return Readiness::Ready;
     }
     let nodes_there = of.nodes_missing.is_empty();
-    let until = if of.patient || !nodes_there { of.deadline } else { of.deadline.min(of.changed + SETTLED) };
+    let until = if of.patient || !nodes_there { of.deadline } else { of.deadline.min(of.changed + SETTLE_TIME) };
     if now < until {
         Readiness::Waits(until)
     } else if nodes_there {

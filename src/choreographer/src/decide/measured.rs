@@ -7,8 +7,8 @@
 //! | `NAME.bytes`, `NAME.width`, `NAME.height` | the same for one topic or service; `/` in its name is written `.` |
 //! | `NAME.typical` | median size of its messages |
 //!
-//! Each is known after [`ENOUGH`] messages, or [`PATIENCE`] after the first; those over all inputs, once each input is
-//! known. Measured values only grow: a servant is not shrunk between two large pictures.
+//! Each is known after [`MIN_MESSAGES`] messages, or [`PATIENCE`] after the first; those over all inputs, once each
+//! input is known. Measured values only grow: a servant is not shrunk between two large pictures.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -20,7 +20,7 @@ use ros::sizes::SizeSummary;
 use super::dictionary::Aux;
 
 /// Number of messages of an input after which its sizes are known.
-pub const ENOUGH: u64 = 8;
+pub const MIN_MESSAGES: u64 = 8;
 /// Time after the first message at which the sizes of an input that sends fewer, such as a map, are known.
 pub const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -39,7 +39,7 @@ pub struct MeasuredInput {
 pub fn aux_from_inputs(inputs: &[MeasuredInput], rows: &[Row]) -> Aux {
     let mut all = BTreeMap::new();
     let used: Vec<&MeasuredInput> = inputs.iter().filter(|input| input.seen.count > 0).collect();
-    let settled = |input: &MeasuredInput| input.seen.count >= ENOUGH || input.known >= PATIENCE;
+    let settled = |input: &MeasuredInput| input.seen.count >= MIN_MESSAGES || input.known >= PATIENCE;
     let whole = used.iter().all(|input| settled(input));
     for input in used {
         if !settled(input) {

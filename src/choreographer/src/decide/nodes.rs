@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::back_off::{RECOVERED, double_pause};
+use super::back_off::{RECOVERY_TIME, double_pause};
 
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
@@ -27,7 +27,7 @@ pub struct NodeExitContext {
 pub struct EndedNode<'a> {
     /// Name of the node.
     pub node: &'a str,
-    /// How it ended, as a phrase that starts with a verb.
+    /// Description of its end, as a phrase that starts with a verb.
     pub how: &'a str,
     /// It did not exit with status 0.
     pub failed: bool,
@@ -51,7 +51,7 @@ pub struct NodeReport {
 /// Action after the exit of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NodeExitAction {
-    /// Nothing is to be done.
+    /// No action is necessary.
     Nothing,
     /// The servant continues without the node.
     Without(NodeReport),
@@ -109,7 +109,7 @@ pub fn decide_after_exit(crew: NodeExitContext, end: EndedNode<'_>) -> NodeExitA
 /// Returns the number of failures in a row, including the one of a node that ran for `ran`, and the pause before its
 /// restart; `None` if it is given up.
 fn restart_pause(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
-    let failures = if ran >= RECOVERED { 1 } else { failures + 1 };
+    let failures = if ran >= RECOVERY_TIME { 1 } else { failures + 1 };
     let pause = || double_pause(FIRST_PAUSE, failures - 1, LONGEST_PAUSE);
     (failures, (failures <= ATTEMPTS).then(pause))
 }
@@ -199,7 +199,7 @@ mod tests {
             let mut in_a_row = 0;
             let mut expected = 0;
             for ran in &runs {
-                in_a_row = if *ran >= RECOVERED { 1 } else { in_a_row + 1 };
+                in_a_row = if *ran >= RECOVERY_TIME { 1 } else { in_a_row + 1 };
                 if in_a_row > ATTEMPTS {
                     break;
                 }

@@ -6,7 +6,7 @@ mod machine;
 use proptest::prelude::*;
 
 use super::Amount;
-use super::admission::{AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, OVERTAKEN, Ticket};
+use super::admission::{AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, MAX_OVERTAKES, Ticket};
 use machine::MachineModel;
 
 /// Services of the machine, with the thousandths of a core promised to each servant; the first needs all cores.
@@ -136,7 +136,7 @@ proptest! {
                 for earlier in &mut waits[..at] {
                     prop_assert!(earlier.2 < priority, "overtaken by one of no higher priority");
                     earlier.3 += 1;
-                    prop_assert!(earlier.3 <= OVERTAKEN, "overtaken for ever");
+                    prop_assert!(earlier.3 <= MAX_OVERTAKES, "overtaken for ever");
                 }
             }
             let promised: u64 = works.iter().sum();

@@ -16,7 +16,7 @@ const PLENTY: f64 = 25.0;
 /// Bytes per second read from swap, from which on the machine swaps.
 const SWAPS: f64 = (1 << 20) as f64;
 /// Bytes per second below which it no longer swaps.
-const SETTLED: f64 = SWAPS / 4.0;
+const CALM_SWAPS: f64 = SWAPS / 4.0;
 /// Time without signs after which a stall has ended.
 const QUIET: Duration = Duration::from_secs(5);
 
@@ -44,7 +44,7 @@ impl StallDetector {
         let full = reading.memory_full.unwrap_or(0.0);
         let (stalls, swaps) = match self.seen {
             None => (STALLS, SWAPS),
-            Some(_) => (FLOWS, SETTLED),
+            Some(_) => (FLOWS, CALM_SWAPS),
         };
         let short = reading.available.is_none_or(|percent| percent < PLENTY);
         let why = if short && full >= stalls {
@@ -96,7 +96,7 @@ mod tests {
             (1, PressureReading::default(), None),
             (2, reading(12.4, 0.0), Some("waited for memory in 12 %")),
             (3, reading(5.0, 0.0), Some("waited for memory in 5 %")),
-            (4, reading(4.9, SETTLED), Some("swaps: it reads 256K per second")),
+            (4, reading(4.9, CALM_SWAPS), Some("swaps: it reads 256K per second")),
             (5, reading(0.0, 0.0), Some("a moment ago")),
             (8, reading(4.9, 0.0), Some("a moment ago")),
             (9, reading(4.9, 0.0), None),

@@ -12,7 +12,7 @@ use super::driver::{self, ServantSource};
 use super::waiting::Permit;
 use super::warm_pool::NOBODY;
 use crate::Error;
-use crate::decide::adoption::{LeftoverContainer, LeftoverFate, StartedNode, decide_fate, is_linked};
+use crate::decide::adoption::{LeftoverContainer, LeftoverFate, decide_fate};
 use crate::decide::demand::LimitSources;
 use crate::{Choreographer, Handle};
 
@@ -34,6 +34,11 @@ fn to_kept_log(gone: &ServantRecord, why: &str) -> KeptLog {
         reason: format!("ended while the daemon was not running{why}"),
         bytes: api::Size(0),
     }
+}
+
+/// Returns whether the servant's shim has told the servant's state.
+fn has_told(servant: &dyn ServantHandle) -> bool {
+    *servant.state().borrow() != ContainerState::Creating
 }
 
 /// Result of adopting what an earlier daemon left.
@@ -75,7 +80,7 @@ impl Choreographer {
                 recorded: record.is_some(),
                 nobodys: record.as_ref().is_some_and(is_unassigned),
                 published: revision.is_some(),
-                empty: servant.nodes().is_empty(),
+                empty: has_told(&*servant) && servant.nodes().is_empty(),
             });
             match (fate, record, revision) {
                 (LeftoverFate::Kept, Some(record), Some(revision)) => {
@@ -174,14 +179,6 @@ impl Choreographer {
         let key = (record.service, record.robot.clone());
         let handle =
             Arc::new(Handle::new(record.id.clone(), record.robot, record.anonymous, asked, revision, record.created));
-        let planned = &handle.revision.plan.nodes;
-        let started = servant.nodes().into_iter().map(|name| StartedNode {
-            planned: planned.iter().any(|node| node.name == name),
-            run: servant.run_id(&name).is_some(),
-        });
-        if is_linked(&started.collect::<Vec<_>>()) {
-            handle.set_linked();
-        }
         {
             let mut servants = inner.servants.lock();
             servants.all.insert(record.id, Arc::clone(&handle));

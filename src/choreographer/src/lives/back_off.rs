@@ -9,7 +9,7 @@ use tokio::time::Instant;
 
 use super::ChoreographerInner;
 use crate::Error;
-use crate::decide::back_off::{FailureStreak, RECOVERED, after_failure, is_forgotten, remaining_pause, seconds};
+use crate::decide::back_off::{FailureStreak, RECOVERY_TIME, after_failure, is_forgotten, remaining_pause, seconds};
 use crate::lives::handle::{Failure, Handle};
 
 pub(crate) use failures::BackOffs;
@@ -17,7 +17,7 @@ pub(crate) use failures::BackOffs;
 /// Common key of robots without a name: each has a name of its own, and would never see its pause.
 const NAMELESS: &str = "~";
 /// Number of entries from which on expired ones are removed.
-const MANY: usize = 256;
+const PRUNE_FROM: usize = 256;
 
 impl BackOffs {
     /// Returns the failures that forbid a servant of this revision for the robot now, with the remaining pause.
@@ -51,7 +51,7 @@ impl BackOffs {
     ) -> FailureStreak {
         let now = Instant::now().into_std();
         let mut failing = self.failing.lock();
-        if failing.len() >= MANY {
+        if failing.len() >= PRUNE_FROM {
             failing.retain(|_, known| !is_forgotten(known, now));
         }
         let key = (service.to_owned(), robot.to_owned());
@@ -100,7 +100,7 @@ impl ChoreographerInner {
             // It was measured with little memory, and robots are given more.
             Err(_) if handle.was_out_of_memory() && handle.gives_way() => return,
             Err(Failure::Broken { reason, .. }) => reason,
-            Ok(_) if ready_for.is_some_and(|time| time >= RECOVERED) => {
+            Ok(_) if ready_for.is_some_and(|time| time >= RECOVERY_TIME) => {
                 return self.back_offs.clear(service, robot);
             }
             _ => return,

@@ -30,7 +30,7 @@ const IN_VAIN: usize = 3;
 /// cores to one robot would leave none for the others.
 const CORES: f64 = 1.0;
 /// Minimum limit of a servant, in thousandths of a core.
-const LEAST: u64 = 10;
+const MIN_LIMIT: u64 = 10;
 /// Time to wait for the end of the servant.
 const ENDS: Duration = Duration::from_secs(10);
 /// Interval between samples of its memory.
@@ -195,7 +195,7 @@ impl Choreographer {
         let (capacity, promised, _) = self.admission().snapshot();
         let own = self.inner.promised_amount(&measured.lease.handle().requested_limits());
         let most = capacity.minus(promised.minus(own)).millicpus;
-        if most < LEAST {
+        if most < MIN_LIMIT {
             let service = measured.lease.handle().service();
             return Err(Error::Calibration(format!(
                 "no capacity to measure {service}: {} cores are free; stop unneeded servants, or pass smaller limits \

@@ -25,7 +25,7 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Timeout for one servant to report its usage, or to apply limits.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Number of rounds between checks of what stubs have reported.
-const LINKED: u64 = 10;
+const LINK_CHECK_ROUNDS: u64 = 10;
 
 /// State between two rounds.
 #[derive(Default)]
@@ -123,7 +123,7 @@ impl ControllerWatch {
     async fn observe(&mut self, inner: &ChoreographerInner) -> Vec<WorkingServant> {
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
         inner.recent.retain(|id| handles.iter().any(|handle| handle.id == id));
-        let fresh = self.looks % LINKED == 0;
+        let fresh = self.looks % LINK_CHECK_ROUNDS == 0;
         self.looks += 1;
         let mut before = std::mem::take(&mut self.servants);
         let mut working = Vec::new();

@@ -137,6 +137,12 @@ async fn run_life(
                 handle.set_promise(permit.promise());
             }
             *kept = permit.take();
+            // Beforehand, so that it is ended if it does not answer.
+            handle.set_container(Arc::clone(container));
+            tokio::select! {
+                told = starting::wait_until_told(handle, &**container) => told?,
+                reason = handle.wait_end_requested() => return Ok(reason),
+            }
             (Arc::clone(container), None, false)
         }
     };

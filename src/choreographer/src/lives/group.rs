@@ -37,7 +37,7 @@ pub(crate) use places::{is_internal_robot, is_place};
 /// Interval between evaluations of a group's load.
 const LOOKS: Duration = Duration::from_millis(250);
 /// Reason for ending the servants of a group without robots.
-const UNUSED: &str = "no robot uses the service";
+const END_WITHOUT_ROBOTS: &str = "no robot uses the service";
 
 impl Groups {
     fn join(&self, inner: &Arc<ChoreographerInner>, handle: &Handle, rules: Shared) -> GroupPlace {
@@ -68,7 +68,7 @@ impl Groups {
         // Under the lock: a robot that comes now creates a new group, which must not take these servants over and lose
         // them.
         for one in shares.servants.lock().iter() {
-            one.lease.handle().end(UNUSED);
+            one.lease.handle().end(END_WITHOUT_ROBOTS);
         }
         let key = (shares.revision.service.clone(), shares.revision.number);
         if all.get(&key).is_some_and(|known| Arc::ptr_eq(known, shares)) {
@@ -174,7 +174,7 @@ async fn run_group(inner: Arc<ChoreographerInner>, shares: Arc<SharedGroup>) {
     }
     for one in std::mem::take(&mut *shares.servants.lock()) {
         if let Some(member) = one.member {
-            shares.group.leave(member, UNUSED);
+            shares.group.leave(member, END_WITHOUT_ROBOTS);
         }
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use api::{Limits, Millis, Phase, Terms};
+use async_trait::async_trait;
 use parking_lot::Mutex;
 use reach::{Reach, Tenant};
 use tokio::sync::watch;
@@ -25,7 +26,7 @@ use store::{NewEvent, RevisionRecord};
 pub enum Failure {
     /// There was no capacity for it.
     Full(AdmissionError),
-    /// Another reason.
+    /// The start failed for another reason.
     Broken {
         /// The failure, as a phrase that starts with a verb.
         reason: String,
@@ -445,16 +446,13 @@ impl Handle {
     }
 }
 
+#[async_trait]
 impl Tenant for Handle {
     fn robot(&self) -> &str {
         &self.robot
     }
 
-    fn limits(&self) -> Limits {
-        Handle::limits(self)
-    }
-
-    fn take_over(&self) -> bool {
+    async fn take_over(&self) -> bool {
         self.set_linked()
     }
 }

@@ -22,7 +22,7 @@ pub(crate) use list::KeptLogs;
 /// Interval between two searches for logs that are too old.
 const LOOK: Duration = Duration::from_secs(3600);
 /// Event kind: a log could not be kept, or not be removed.
-const NOT_KEPT: &str = "log-not-kept";
+const LOG_NOT_KEPT: &str = "log-not-kept";
 
 impl ChoreographerInner {
     /// Ends the processes of a servant and keeps its log, unless its service was removed or no logs are kept. The
@@ -51,7 +51,7 @@ impl ChoreographerInner {
             }
             Err(error) => {
                 let message = format!("the log of servant {} is lost: {error}", handle.id);
-                self.journal.warning(NOT_KEPT, &message, &handle.event_context());
+                self.journal.warning(LOG_NOT_KEPT, &message, &handle.event_context());
             }
         }
     }
@@ -63,7 +63,7 @@ impl ChoreographerInner {
             Ok(found) => self.settle_logs(found).await,
             Err(error) => {
                 let message = format!("cannot list the logs of ended servants: {error}");
-                self.journal.warning(NOT_KEPT, &message, &NewEvent::default());
+                self.journal.warning(LOG_NOT_KEPT, &message, &NewEvent::default());
             }
         }
     }
@@ -88,13 +88,18 @@ impl ChoreographerInner {
         let oldest = store::now().saturating_sub(options.age.as_millis() as u64);
         let (mut kept, mut gone): (Vec<KeptLog>, Vec<KeptLog>) =
             all.into_iter().partition(|one| one.ended >= oldest && owners[&one.service].is_some());
-        let file = |one| to_quota_file(one, &owners);
-        let evicted = match kept.split_first() {
-            Some((newest, others)) => {
-                let others: Vec<QuotaFile<'_>> = others.iter().map(file).collect();
-                find_files_to_evict(&others, file(newest), options.quota)
+        let evicted = loop {
+            let Some((newest, others)) = kept.split_first() else {
+                break Vec::new();
+            };
+            let files: Vec<QuotaFile<'_>> = others.iter().map(|one| to_quota_file(one, &owners)).collect();
+            match find_files_to_evict(&files, to_quota_file(newest, &owners), options.quota) {
+                Some(evicted) => break evicted,
+                None => {
+                    self.report_no_room(newest);
+                    gone.push(kept.remove(0));
+                }
             }
-            None => Vec::new(),
         };
         // Their places are after the newest.
         let mut places: Vec<usize> = evicted.into_iter().map(|place| place + 1).collect();
@@ -104,6 +109,18 @@ impl ChoreographerInner {
         self.remove_logs(gone).await;
     }
 
+    fn report_no_room(&self, log: &KeptLog) {
+        let message = format!(
+            "the log of servant {} is not kept: it has {}, and the logs of those that use less leave no room for it in \
+             the {} of all (disk and servants in [logs])",
+            log.servant,
+            log.bytes,
+            api::Size(self.options.kept_logs.quota.bytes)
+        );
+        let about = NewEvent { service: Some(&log.service), servant: Some(&log.servant), robot: Some(&log.robot) };
+        self.journal.warning(LOG_NOT_KEPT, &message, &about);
+    }
+
     async fn remove_logs(&self, gone: Vec<KeptLog>) {
         if gone.is_empty() {
             return;
@@ -111,7 +128,7 @@ impl ChoreographerInner {
         let ids = gone.into_iter().map(|one| one.servant).collect();
         for error in self.engine.remove_kept_logs(ids).await {
             let message = format!("cannot remove the log of an ended servant: {error}");
-            self.journal.warning(NOT_KEPT, &message, &NewEvent::default());
+            self.journal.warning(LOG_NOT_KEPT, &message, &NewEvent::default());
         }
     }
 }

@@ -31,16 +31,14 @@ pub(super) async fn wait_for_interface(
     let mut changed = Instant::now();
     loop {
         let graph = graphs.borrow_and_update().clone();
-        if let Some(refused) = lifecycles.as_mut().and_then(find_refused) {
+        if let Some(refused) = find_refused(&mut lifecycles) {
             return Err(Failure::from_reason(format!("is unusable: {refused}")));
         }
-        let loading = loads.as_mut().map(loading_containers).transpose()?;
+        let loading = loading_containers(&mut loads)?;
         let mut missing = missing_endpoints(interface, &graph);
         let mut nodes_missing = missing_nodes(interface, &graph);
-        if let Some(stages) = &lifecycles {
-            missing.extend(inactive_nodes(&stages.borrow()));
-        }
-        for container in loading.unwrap_or_default() {
+        missing.extend(inactive_nodes(&lifecycles.borrow()));
+        for container in loading {
             missing.push(format!("the components of {container}"));
             nodes_missing.push(format!("the nodes of {container}"));
         }
@@ -101,13 +99,10 @@ fn loading_containers(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>,
     loading.collect()
 }
 
-async fn wait_changed<T>(of: &mut Option<watch::Receiver<T>>) {
-    let changed = match of {
-        Some(of) => of.changed().await,
-        None => return std::future::pending().await,
-    };
-    if changed.is_err() {
-        *of = None;
+/// Waits for a change; forever if there will be none.
+async fn wait_changed<T>(of: &mut watch::Receiver<T>) {
+    if of.changed().await.is_err() {
+        std::future::pending().await
     }
 }
 

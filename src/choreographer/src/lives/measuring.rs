@@ -131,14 +131,14 @@ impl InputWatch {
 
     /// Returns the measured inputs, without values that change with each message and carry no news.
     fn inputs(&mut self, seen: Vec<(String, SizeSummary)>, now: Instant) -> Vec<MeasuredInput> {
-        use crate::decide::measured::{ENOUGH, PATIENCE};
+        use crate::decide::measured::{MIN_MESSAGES, PATIENCE};
         let seen = seen.into_iter().filter(|(_, seen)| seen.count > 0);
         seen.map(|(name, seen)| {
             let first = *self.first.entry(name.clone()).or_insert(now);
             let known = now.saturating_duration_since(first).min(PATIENCE);
             MeasuredInput {
                 known: if known < PATIENCE { Duration::ZERO } else { known },
-                seen: SizeSummary { count: seen.count.min(ENOUGH), ..seen },
+                seen: SizeSummary { count: seen.count.min(MIN_MESSAGES), ..seen },
                 name,
             }
         })

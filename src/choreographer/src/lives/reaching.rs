@@ -1,10 +1,11 @@
 //! Connects to the ROS in containers, and records what servants and robots report.
 
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use api::Level;
-use bridge::{BridgeOptions, RequestObserver};
+use async_trait::async_trait;
+use bridge::BridgeOptions;
 use catalogue::{Catalogue, RevisionContents};
 use link::control::RequestTiming;
 use reach::links::{MeasuredRequest, RequestUpdate};
@@ -52,7 +53,6 @@ pub(crate) fn reach_options(
         ros: revision.flavour.ros.ros_version(),
         distribution: revision.flavour.distribution.clone(),
         bridge: BridgeOptions {
-            called: measures.rosbridge_observer(),
             pair: find_topic_request(revision.flavour.ros.ros_version(), &revision.interface),
             ..inner.options.bridge.clone()
         },
@@ -82,14 +82,14 @@ pub(crate) struct RequestRecorder {
 }
 
 impl RequestRecorder {
-    pub(crate) fn new(inner: &ChoreographerInner, revision: &Arc<RevisionRecord>, servant: &str) -> Arc<Self> {
-        Arc::new(RequestRecorder {
+    pub(crate) fn new(inner: &ChoreographerInner, revision: &Arc<RevisionRecord>, servant: &str) -> Self {
+        RequestRecorder {
             servant: servant.to_owned(),
             revision: Arc::clone(revision),
             request_times: Arc::clone(&inner.request_times),
             recent: Arc::clone(&inner.recent),
             rollouts: Arc::clone(&inner.rollouts),
-        })
+        }
     }
 
     /// Records news about a request, which took `cloud` milliseconds in the cloud.
@@ -110,16 +110,12 @@ impl RequestRecorder {
         }
     }
 
-    /// Returns an observer of rosbridge clients' requests. The time between client and bridge is unknown: the measured
-    /// time is slightly less than what robots see, and all of it counts as the cloud's.
-    pub(crate) fn rosbridge_observer(self: &Arc<Self>) -> RequestObserver {
-        let measures = Arc::clone(self);
-        RequestObserver::new(move |took| {
-            let total = took.map(|took| took.as_secs_f64() * 1e3);
-            let request = RequestTiming { total, ..RequestTiming::default() };
-            let cloud = total.unwrap_or_default();
-            measures.record(&request, cloud, RequestUpdate::Answered);
-        })
+    /// Records a request of a rosbridge client. The time between client and bridge is unknown: the measured time is
+    /// slightly less than what robots see, and all of it counts as the cloud's.
+    pub(crate) fn record_rosbridge(&self, took: Option<Duration>) {
+        let total = took.map(|took| took.as_secs_f64() * 1e3);
+        let request = RequestTiming { total, ..RequestTiming::default() };
+        self.record(&request, total.unwrap_or_default(), RequestUpdate::Answered);
     }
 }
 
@@ -148,12 +144,13 @@ struct ServantObserver {
     revision: Arc<RevisionRecord>,
     catalogue: Arc<Catalogue>,
     journal: Journal,
-    measures: Arc<RequestRecorder>,
+    measures: RequestRecorder,
     tracer: Option<Arc<dyn RequestTracer>>,
 }
 
+#[async_trait]
 impl Observer for ServantObserver {
-    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), FailureReason> {
+    async fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), FailureReason> {
         self.catalogue
             .check_stub_compatibility(&self.revision, made_of, image)
             .map_err(|error| FailureReason::new(error.to_string()))
@@ -181,5 +178,9 @@ impl Observer for ServantObserver {
             let servant = TracedServant { service: &self.revision.service, servant: &self.id, robot };
             tracer.record(servant, request);
         }
+    }
+
+    fn on_rosbridge_request(&self, took: Option<Duration>) {
+        self.measures.record_rosbridge(took);
     }
 }

@@ -14,9 +14,9 @@ use crate::decide::controller::MeasuredTimes;
 /// Age up to which requests count.
 const LATELY: Duration = Duration::from_secs(10);
 /// Maximum number of requests remembered per servant.
-const MOST: usize = 256;
+const MAX_REQUESTS: usize = 256;
 /// Minimum number of requests for a decision.
-const LEAST: usize = 3;
+const MIN_REQUESTS: usize = 3;
 
 /// Capacity of a subscription; a slower subscriber loses the oldest.
 const UNHEARD: usize = 1024;
@@ -74,7 +74,7 @@ impl RecentRequests {
             Some(known) => known,
             None => all.entry(servant.to_owned()).or_default(),
         };
-        if took.len() >= MOST {
+        if took.len() >= MAX_REQUESTS {
             took.pop_front();
         }
         let age = Duration::try_from_secs_f64(total / 1e3).ok();
@@ -99,7 +99,7 @@ impl RecentRequests {
 
     fn p95_times(&self, servant: &str, since: Option<Instant>, now: Instant) -> Option<MeasuredTimes> {
         let (total, cloud) = self.times(servant, since, now)?;
-        if total.len() < LEAST {
+        if total.len() < MIN_REQUESTS {
             return None;
         }
         Some(MeasuredTimes { total: nearest_rank(&total, 95)?, cloud: nearest_rank(&cloud, 95)? })
@@ -159,7 +159,7 @@ mod tests {
         let shown = ResponseTimes { requests: 20, p50_ms: 10.0, p95_ms: 19.0 };
         assert_eq!(recent.response_times("a", now), Some(shown));
         // The time in the cloud is at most the total.
-        for _ in 0..LEAST {
+        for _ in 0..MIN_REQUESTS {
             recent.record("b", 5.0, f64::INFINITY, now);
             recent.record("c", 5.0, 70.0, now);
         }
@@ -200,9 +200,9 @@ mod tests {
     fn robots_cannot_make_it_grow() {
         let recent = RecentRequests::default();
         let now = Instant::now();
-        for _ in 0..10 * MOST {
+        for _ in 0..10 * MAX_REQUESTS {
             recent.record("a", 1.0, 1.0, now);
         }
-        assert_eq!(recent.by_servant.lock()["a"].len(), MOST);
+        assert_eq!(recent.by_servant.lock()["a"].len(), MAX_REQUESTS);
     }
 }

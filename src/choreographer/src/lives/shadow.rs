@@ -33,14 +33,14 @@ use crate::{Choreographer, Error, Lease, MeasuredServant};
 use mirror::Mirror;
 
 /// Prefix of a candidate's name, in place of a robot's name: no robot can have it.
-const NAMED: &str = "~shadow-";
+const NAME_PREFIX: &str = "~shadow-";
 /// Interval between checks whether a robot uses the service.
 const LOOK: Duration = Duration::from_millis(200);
 
 impl Handle {
     /// Returns true if it is a candidate beside a robot's servant.
     pub(crate) fn is_candidate(&self) -> bool {
-        self.robot.starts_with(NAMED)
+        self.robot.starts_with(NAME_PREFIX)
     }
 }
 
@@ -173,7 +173,7 @@ impl Choreographer {
         };
         let handle = Arc::new(Handle::new(
             names::servant_id(&revision.service),
-            format!("{NAMED}{}", names::random(6)),
+            format!("{NAME_PREFIX}{}", names::random(6)),
             true,
             asked,
             revision,

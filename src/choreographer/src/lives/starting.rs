@@ -1,20 +1,25 @@
-//! Starts admitted servants: their container is made, or taken from the warm pool.
+//! Starts admitted servants: their container is made, taken from the warm pool, or that of an earlier daemon.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures_util::future::join_all;
 use reach::Reach;
 use reach::master::resident_config;
-use servant::engine::ServantHandle;
+use servant::engine::{ContainerState, ServantHandle};
 use servant::spec::{NodeSpec, Spec};
 use store::{NewEvent, RevisionRecord, ServantRecord};
-use tokio::time::{Instant, timeout_at};
+use tokio::time::{Instant, timeout, timeout_at};
 
 use super::warm_pool::WarmServant;
 use super::{ChoreographerInner, limits, reaching};
 use crate::Error;
+use crate::decide::adoption::{StartedNode, is_linked};
 use crate::decide::terms::limits_in_words;
 use crate::lives::handle::{Failure, Handle};
+
+/// Time for the shim of an adopted servant to answer.
+const ANSWER: Duration = Duration::from_secs(10);
 
 /// Records the servant before it runs: a daemon that is killed now finds it again.
 pub(super) fn record(inner: &ChoreographerInner, handle: &Handle) -> Result<(), Failure> {
@@ -40,6 +45,27 @@ pub(super) async fn start(
     let spec = container_spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes);
     let started = inner.engine.start(spec.map_err(start_failure)?).await;
     started.map_err(|error| start_failure(error.into()))
+}
+
+/// Waits until the shim of an adopted servant has told the servant's state, and notes who starts its nodes.
+pub(super) async fn wait_until_told(handle: &Handle, servant: &dyn ServantHandle) -> Result<(), Failure> {
+    let mut states = servant.state();
+    let told = states.wait_for(|state| *state != ContainerState::Creating);
+    if timeout(ANSWER, told).await.is_err() {
+        let waited = ANSWER.as_secs();
+        return Err(Failure::from_reason(format!(
+            "was given up: its shim did not answer the next daemon in {waited} s"
+        )));
+    }
+    let planned = &handle.revision.plan.nodes;
+    let started = servant.nodes().into_iter().map(|name| StartedNode {
+        planned: planned.iter().any(|node| node.name == name),
+        run: servant.run_id(&name).is_some(),
+    });
+    if is_linked(&started.collect::<Vec<_>>()) {
+        handle.set_linked();
+    }
+    Ok(())
 }
 
 /// Returns the nodes to start with: those of a robot's stubs are started one by one later.

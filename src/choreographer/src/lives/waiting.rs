@@ -18,9 +18,9 @@ use crate::decide::capacity::{PushPromise, Shortage};
 
 /// Time within which a robot that waited in vain, or lost its connection meanwhile, keeps its position when it asks
 /// again.
-const KEPT: Duration = Duration::from_secs(30);
+const POSITION_EXPIRY: Duration = Duration::from_secs(30);
 /// Maximum number of kept positions.
-const MOST_KEPT: usize = 1000;
+const MAX_POSITIONS: usize = 1000;
 
 /// The machine's capacity for servants, shared by all requesters.
 #[derive(Clone)]
@@ -292,7 +292,7 @@ impl Admission {
         let (mut waiting, admitted) = {
             let mut desk = self.desk.lock();
             let kept = who.and_then(|who| desk.kept.remove(who));
-            let kept = kept.filter(|kept| kept.since.elapsed() < KEPT);
+            let kept = kept.filter(|kept| kept.since.elapsed() < POSITION_EXPIRY);
             let (ticket, (verdict, others)) = match kept {
                 Some(kept) => (kept.ticket, desk.book.request_again(kept.ticket, ask, kept.overtaken)),
                 None => {
@@ -360,8 +360,8 @@ impl AdmissionState {
     /// Keeps the position of a request that waits, or was admitted without being notified, for its next attempt.
     fn keep_position(&mut self, who: &str, ticket: Ticket) {
         let overtaken = self.book.overtaken_count(ticket).unwrap_or(0);
-        self.kept.retain(|_, kept| kept.since.elapsed() < KEPT);
-        if self.kept.len() < MOST_KEPT {
+        self.kept.retain(|_, kept| kept.since.elapsed() < POSITION_EXPIRY);
+        if self.kept.len() < MAX_POSITIONS {
             let kept = KeptPosition { ticket, overtaken, since: Instant::now() };
             self.kept.insert(who.to_owned(), kept);
         }
@@ -480,7 +480,7 @@ mod tests {
         });
         again.expect_err("nothing is free");
         // Too late, and under another name.
-        tokio::time::sleep(KEPT).await;
+        tokio::time::sleep(POSITION_EXPIRY).await;
         for who in ["a", "c"] {
             let (stands, again) = asks(who, SECOND);
             let (again, ()) = tokio::join!(again, async {
@@ -536,7 +536,7 @@ mod tests {
                     waits.abort();
                     let _ = waits.await;
                 }
-                tokio::time::sleep(KEPT).await;
+                tokio::time::sleep(POSITION_EXPIRY).await;
             }
         }
         assert_eq!(room.snapshot().2, 0);
@@ -544,8 +544,8 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn kept_places_are_few() {
-        let room = Admission::new(Amount::new(0.0, 0), 2 * MOST_KEPT);
-        let waits = (0..MOST_KEPT + 10).map(|number| {
+        let room = Admission::new(Amount::new(0.0, 0), 2 * MAX_POSITIONS);
+        let waits = (0..MAX_POSITIONS + 10).map(|number| {
             let (room, ask) = (room.clone(), AdmissionRequest::robot(Amount::NONE, 0));
             room.set_stall(Some("it swaps".into()));
             async move {
@@ -556,7 +556,7 @@ mod tests {
             }
         });
         futures_util::future::join_all(waits).await;
-        assert_eq!(room.desk.lock().kept.len(), MOST_KEPT);
+        assert_eq!(room.desk.lock().kept.len(), MAX_POSITIONS);
     }
 
     #[tokio::test(start_paused = true)]

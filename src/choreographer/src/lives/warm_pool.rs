@@ -37,12 +37,12 @@ const UNMADE: &str = "~warm-container";
 /// Weight of the last lead time in their mean.
 const LAST: f64 = 0.3;
 /// Maximum number of taken containers of one service whose times are remembered until they are replaced.
-const TAKEN: usize = 64;
+const MAX_TAKEN_TIMES: usize = 64;
 
 impl LeadTime {
     fn record_taken(&mut self, now: Instant) {
         self.taken.push_back(now);
-        if self.taken.len() > TAKEN {
+        if self.taken.len() > MAX_TAKEN_TIMES {
             self.taken.pop_front();
         }
     }

@@ -24,7 +24,7 @@ fn record_requests(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
     let measures = RequestRecorder::new(&daemon.inner, &handle.revision, &handle.id);
     for _ in 0..3 {
         let took = Duration::from_secs_f64(milliseconds / 1e3);
-        measures.rosbridge_observer().record(Some(took));
+        measures.record_rosbridge(Some(took));
     }
 }
 

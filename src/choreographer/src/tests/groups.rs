@@ -16,9 +16,9 @@ use tokio::sync::Semaphore;
 
 use super::servants::World;
 use super::*;
-use crate::decide::group::LEFT;
+use crate::decide::group::MAX_FORMER_ROBOTS;
 
-const LONG: Duration = Duration::from_secs(600);
+const PATIENCE: Duration = Duration::from_secs(600);
 
 /// A service that echoes its request with its servant's id; each answer takes a permit.
 struct Echo {
@@ -125,7 +125,7 @@ async fn robot(daemon: &Choreographer, name: &str) -> (Lease, Arc<dyn Bus>) {
 }
 
 async fn call(bus: &Arc<dyn Bus>, words: &str) -> Result<String, String> {
-    let answer = bus.call("/echo", Bytes::from(words.to_owned()), LONG).await;
+    let answer = bus.call("/echo", Bytes::from(words.to_owned()), PATIENCE).await;
     let answer = answer.map_err(|error: BusError| error.to_string())?;
     Ok(String::from_utf8_lossy(&answer).into_owned())
 }
@@ -133,7 +133,7 @@ async fn call(bus: &Arc<dyn Bus>, words: &str) -> Result<String, String> {
 /// Returns a client of `/count` that has sent this number of goals.
 async fn send_goals(bus: &Arc<dyn Bus>, goals: usize) -> (Box<dyn ActionClient>, Arc<Ends>) {
     let client = bus.action_client("/count", &count()).expect("an action");
-    client.wait_for_server(LONG).await.expect("it is served");
+    client.wait_for_server(PATIENCE).await.expect("it is served");
     let ends = Arc::<Ends>::default();
     for number in 0..goals {
         let goal = Bytes::from_static(&[1, 0, 0, 0]);
@@ -349,13 +349,13 @@ async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
     let daemon = shop.world.daemon();
     let began = tokio::time::Instant::now();
     let (_lease, bus) = robot(&daemon, "stays").await;
-    for number in 0..2 * LEFT {
+    for number in 0..2 * MAX_FORMER_ROBOTS {
         drop(robot(&daemon, &format!("r{number}")).await);
     }
     let (last, _) = robot(&daemon, "last").await;
     let id = last.handle().id.clone();
     drop(last);
-    wait_for_group(&daemon, |group| group.robots <= LEFT + 1).await;
+    wait_for_group(&daemon, |group| group.robots <= MAX_FORMER_ROBOTS + 1).await;
     assert!(began.elapsed() < options().grace, "all of them were kept until their time was over");
     // The robot that left last finds its place, and the one that stayed was not disturbed.
     let (last, _) = robot(&daemon, "last").await;
@@ -401,7 +401,7 @@ async fn a_goal_that_its_node_does_not_end_holds_up_others_only_while_its_robot_
     let (_two, two) = robot(&daemon, "two").await;
     let (client, _) = send_goals(&one, 1).await;
     let (_other, _) = send_goals(&two, 1).await;
-    tokio::time::sleep(LONG).await;
+    tokio::time::sleep(PATIENCE).await;
     assert_eq!(shop.goals.load(Ordering::SeqCst), 1, "the robot's alone");
     drop(client);
     let taken = async {
@@ -409,7 +409,7 @@ async fn a_goal_that_its_node_does_not_end_holds_up_others_only_while_its_robot_
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
     };
-    let taken = tokio::time::timeout(LONG, taken).await;
+    let taken = tokio::time::timeout(PATIENCE, taken).await;
     assert!(taken.is_ok(), "the other's waits for ever");
 }
 
@@ -421,7 +421,7 @@ async fn a_robot_has_no_more_than_so_many_goals() {
     let (client, ends) = send_goals(&bus, 300).await;
     // A goal with an id that another one has.
     client.send_goal("7", Bytes::from_static(&[1, 0, 0, 0]), ends.clone());
-    tokio::time::sleep(LONG).await;
+    tokio::time::sleep(PATIENCE).await;
     assert_eq!(shop.goals.load(Ordering::SeqCst), 256);
     let ends = ends.0.lock();
     let rejected = ends.iter().flatten();

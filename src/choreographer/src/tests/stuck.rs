@@ -8,7 +8,7 @@ use crate::options::HungPolicy;
 
 const SECOND: Duration = Duration::from_secs(1);
 /// Number of each kind: in any order, a stuck servant comes before one that is not.
-const EACH: usize = 4;
+const SERVANTS_PER_KIND: usize = 4;
 
 fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
     world.engine.servant(&lease.handle().id).expect("it runs")
@@ -17,7 +17,7 @@ fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
 /// Starts robots whose servants answer, and as many whose servants stop answering now.
 async fn robots(world: &World, daemon: &Choreographer, query: &[(&str, &str)]) -> (Vec<Lease>, Vec<Lease>) {
     let (mut sound, mut stuck) = (Vec::new(), Vec::new());
-    for number in 0..EACH {
+    for number in 0..SERVANTS_PER_KIND {
         sound.push(ready(daemon, request_stating(&format!("sound{number}"), query)).await);
         stuck.push(ready(daemon, request_stating(&format!("stuck{number}"), query)).await);
     }
@@ -85,14 +85,14 @@ async fn nodes_that_hang_are_ended_although_other_servants_are_stuck() {
             container(&world, lease).flow.lock().0 += 10;
         }
     }
-    assert_eq!(world.event_messages("node-hung").len(), 2 * EACH);
-    assert_eq!(world.event_messages("node-failed").len(), EACH, "each that answers was ended");
+    assert_eq!(world.event_messages("node-hung").len(), 2 * SERVANTS_PER_KIND);
+    assert_eq!(world.event_messages("node-failed").len(), SERVANTS_PER_KIND, "each that answers was ended");
     // A servant that does not answer is reported, and watched as before.
     for lease in &stuck {
         container(&world, lease).stuck.send_replace(false);
     }
     tokio::time::sleep(SECOND).await;
-    assert_eq!(world.event_messages("node-failed").len(), 2 * EACH);
+    assert_eq!(world.event_messages("node-failed").len(), 2 * SERVANTS_PER_KIND);
 }
 
 #[tokio::test(start_paused = true)]
@@ -108,7 +108,7 @@ async fn cores_are_moved_although_other_servants_are_stuck() {
         let inner = &daemon.inner;
         let measures = crate::lives::reaching::RequestRecorder::new(inner, &handle.revision, &handle.id);
         for _ in 0..3 {
-            measures.rosbridge_observer().record(Some(Duration::from_millis(95)));
+            measures.record_rosbridge(Some(Duration::from_millis(95)));
         }
     };
     let moved = |lease: &Lease| container(&world, lease).enforced_limits().limits.cpus > Some(0.02);
@@ -120,4 +120,32 @@ async fn cores_are_moved_although_other_servants_are_stuck() {
         sound.iter().chain(&stuck).for_each(takes);
         tokio::time::sleep(SECOND).await;
     }
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_find_their_servants_after_a_restart_although_other_shims_do_not_answer() {
+    let world = World::new();
+    world.publish("greet", "/greet", |_| {});
+    let query = [("cpus", "0.1")];
+    let daemon = world.daemon();
+    let (sound, stuck) = robots(&world, &daemon, &query).await;
+    for lease in &stuck {
+        container(&world, lease).hide_state(true);
+    }
+    let next = world.daemon();
+    let began = tokio::time::Instant::now();
+    let inherited = next.adopt().await.expect("it starts");
+    assert_eq!(inherited.adopted, 2 * SERVANTS_PER_KIND);
+    let again = |lease: &Lease| request_stating(&lease.handle().robot, &query);
+    for lease in &sound {
+        assert_eq!(ready(&next, again(lease)).await.handle().id, lease.handle().id);
+    }
+    assert!(began.elapsed() < SECOND, "they wait for those that are stuck");
+    // One answers after all.
+    container(&world, &stuck[0]).hide_state(false);
+    assert_eq!(ready(&next, again(&stuck[0])).await.handle().id, stuck[0].handle().id);
+    let silent = next.ensure(again(&stuck[1])).expect("a lease");
+    assert_eq!(silent.handle().id, stuck[1].handle().id);
+    let refused = silent.wait_ready().await.err().expect("it does not answer").to_string();
+    assert!(refused.contains("its shim did not answer"), "{refused}");
 }

@@ -1,6 +1,6 @@
 //! Checks of a configuration's values, alone and together, that types cannot express.
 
-use super::{CodecSetting, Config, MOST, OUTPUT_MEASURES};
+use super::{CodecSetting, Config, MAX_NUMBER, OUTPUT_MEASURES};
 use crate::terms;
 
 /// A key with an invalid value.
@@ -29,8 +29,8 @@ impl Config {
             ("call_limit", Some(self.call_limit)),
         ];
         for (key, value) in times.into_iter().chain(measured) {
-            if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
-                let reason = format!("is {value}; it should be a number greater than 0 and less than {MOST}");
+            if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MAX_NUMBER)) {
+                let reason = format!("is {value}; it should be a number greater than 0 and less than {MAX_NUMBER}");
                 return wrong(key, reason);
             }
         }

@@ -18,7 +18,7 @@ use crate::revision::Revision;
 /// The stub that is examined.
 #[derive(Debug, Clone)]
 pub struct ExaminedStub {
-    /// Its directory `share/PKG`.
+    /// Directory `share/PKG` of the package.
     pub share: PathBuf,
     /// The ROS package.
     pub package: String,

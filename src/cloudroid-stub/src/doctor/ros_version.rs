@@ -12,10 +12,10 @@ use crate::setup::{self, RosSetup, VERSION};
 const NAME: &str = "ros";
 
 /// Directory of the install spaces of upstream's packages.
-pub(super) const INSTALLED: &str = "/opt/ros";
+pub(super) const UPSTREAM_SPACES: &str = "/opt/ros";
 
 /// Checks the environment of `variable` for a stub of `service`, for robots of the version `wanted`. `installed`: the
-/// directory of the install spaces, [`INSTALLED`].
+/// directory of the install spaces, [`UPSTREAM_SPACES`].
 pub(super) fn check(wanted: RosVersion, service: &str, variable: Variable<'_>, installed: &Path) -> Check {
     let Some(found) = RosSetup::read(variable) else {
         return check_unset(wanted, service, variable, installed);
@@ -98,7 +98,7 @@ mod tests {
     struct Computer(tempfile::TempDir);
 
     impl Computer {
-        fn with(files: &[&str]) -> Computer {
+        fn with_files(files: &[&str]) -> Computer {
             let place = tempfile::tempdir().expect("a directory");
             for file in files {
                 let path = place.path().join(file);
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn the_ros_that_is_sourced_decides_where_both_are_installed() {
-        let robot = Computer::with(&[NOETIC, JAZZY, "usr/bin/rosrun"]);
+        let robot = Computer::with_files(&[NOETIC, JAZZY, "usr/bin/rosrun"]);
         let one = [("ROS_VERSION", "1"), ("ROS_DISTRO", "noetic")];
         let two = [("ROS_VERSION", "2"), ("ROS_DISTRO", "jazzy")];
         assert_check(&robot.examine(RosVersion::One, &one), Good, "ROS 1 is set up (noetic)", "");
@@ -144,11 +144,11 @@ mod tests {
 
     #[test]
     fn where_nothing_is_sourced_the_setup_file_is_named() {
-        let both = Computer::with(&[NOETIC, FOXY, JAZZY]);
+        let both = Computer::with_files(&[NOETIC, FOXY, JAZZY]);
         let warned = both.examine(RosVersion::Two, &[]);
         assert_check(&warned, Warning, "ROS_VERSION is not set", "opt/ros/jazzy/setup.sh");
         assert_check(&both.examine(RosVersion::One, &[]), Warning, "of ROS 1 was sourced", "opt/ros/noetic/setup.sh");
-        let empty = Computer::with(&[]);
+        let empty = Computer::with_files(&[]);
         assert_check(&empty.examine(RosVersion::Two, &[]), Warning, "is not set", "/DISTRIBUTION/setup.sh");
         // A value that means nothing is none.
         assert_check(&empty.examine(RosVersion::Two, &[("ROS_VERSION", "x")]), Warning, "is not set", "setup.sh");
@@ -156,18 +156,18 @@ mod tests {
 
     #[test]
     fn a_robot_that_has_only_the_other_ros_is_refused() {
-        let jazzy = Computer::with(&[JAZZY]);
+        let jazzy = Computer::with_files(&[JAZZY]);
         assert_check(&jazzy.examine(RosVersion::One, &[]), Bad, "this robot has ROS 2", "--ros 2");
-        let debian = Computer::with(&["usr/bin/rosrun"]);
+        let debian = Computer::with_files(&["usr/bin/rosrun"]);
         assert_check(&debian.examine(RosVersion::Two, &[]), Bad, "usr/bin/rosrun", "--ros 1");
     }
 
     #[test]
     fn debians_own_ros_needs_no_setup_file() {
-        let debian = Computer::with(&["usr/bin/roslaunch"]);
+        let debian = Computer::with_files(&["usr/bin/roslaunch"]);
         assert_check(&debian.examine(RosVersion::One, &[]), Good, "usr/bin/roslaunch is of ROS 1", "");
         // Beside it ROS 2 may be installed.
-        let both = Computer::with(&["usr/bin/roslaunch", JAZZY]);
+        let both = Computer::with_files(&["usr/bin/roslaunch", JAZZY]);
         assert_check(&both.examine(RosVersion::Two, &[]), Warning, "is not set", "opt/ros/jazzy/setup.sh");
     }
 }

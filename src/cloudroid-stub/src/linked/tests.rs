@@ -119,3 +119,21 @@ async fn a_link_that_is_lost_as_soon_as_it_is_accepted_is_tried_ever_more_seldom
     sleep(PAUSES.stood).await;
     assert!(waited(accepted).await <= PAUSE);
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_server_that_refuses_is_tried_soon_and_then_ever_more_seldom() {
+    let mut pace = RetryPace::default();
+    let mut waited = async || {
+        let refused = Instant::now();
+        pace.on_refused(&PAUSES);
+        pace.wait(PAUSES.refused).await;
+        pace.start_attempt();
+        refused.elapsed()
+    };
+    let first = waited().await;
+    assert!(PAUSES.busy / 2 <= first && first <= PAUSES.busy, "{first:?}");
+    for _ in 0..4 {
+        waited().await;
+    }
+    assert!(waited().await >= PAUSES.refused / 2);
+}

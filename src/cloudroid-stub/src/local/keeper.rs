@@ -6,19 +6,19 @@ mod effects;
 mod goal_messages;
 mod goals;
 mod inputs;
-mod kept;
+mod kept_inputs;
 mod managing;
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{
-    DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, Phases, QosEvent, QosSla,
-    RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
+    DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, OutputAge, Phases, QosEvent,
+    QosSla, RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
 };
 use ros::bus::{FailureReason, SerializedMessage, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -31,7 +31,7 @@ use super::remembered::RememberedSettings;
 use super::stamp::{StampReader, age};
 use context::LocalContext;
 use goals::KeeperGoals;
-use kept::{RetainedInput, RetainedInputs};
+use kept_inputs::{RetainedInput, RetainedInputs};
 
 /// The connection to the servant.
 pub trait Cloud: Send + Sync + 'static {
@@ -213,8 +213,8 @@ impl Keeper {
     }
 
     /// Handles a message that the servant's node has published; returns whether to publish it to the application.
-    pub fn on_cloud_output(&self, topic: &str, message: &SerializedMessage, phases: Option<Phases>) -> bool {
-        self.on_output(Responder::Cloud, topic, message, phases)
+    pub fn on_cloud_output(&self, topic: &str, message: &SerializedMessage, timing: OutputTiming) -> bool {
+        self.on_output(Responder::Cloud, topic, message, timing)
     }
 
     /// Handles a link that is up; `resumed` is set if earlier requests will still be answered.
@@ -250,14 +250,14 @@ impl Keeper {
         }
     }
 
-    fn on_output(&self, side: Responder, topic: &str, message: &SerializedMessage, phases: Option<Phases>) -> bool {
+    fn on_output(&self, side: Responder, topic: &str, message: &SerializedMessage, timing: OutputTiming) -> bool {
         let verdict = self.update(|state, now| {
             let stamp = state.stamps.read_stamp(message).filter(|stamp| !stamp.is_zero());
-            let age = stamp.map(age).unwrap_or_default();
+            let age = OutputAge { since_stamp: stamp.map(age).unwrap_or_default(), since_input: timing.since_input };
             let key = goals::feedback_key(topic, message);
             let key = key.or_else(|| state.stamps.key(message));
             let verdict = state.governor.output(now, side, topic, key, age);
-            if let Some(phases) = phases {
+            if let Some(phases) = timing.phases {
                 state.governor.record_phases(&phases);
             }
             verdict
@@ -301,6 +301,15 @@ impl State {
             let _ = caller.send(answer);
         }
     }
+}
+
+/// Times of an output, as far as the link knows them.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct OutputTiming {
+    /// See [`OutputAge::since_input`].
+    pub since_input: Option<Duration>,
+    /// Phases of the input that it may answer.
+    pub phases: Option<Phases>,
 }
 
 /// Cancels a request whose caller is gone.
@@ -349,7 +358,7 @@ async fn process_original_events(keeper: Weak<Keeper>, mut news: mpsc::Unbounded
             }),
             OriginalEvent::Crashed(reason) => keeper.update(|state, now| state.governor.on_local_crash(now, &reason)),
             OriginalEvent::Output(topic, message) => {
-                if keeper.on_output(Responder::Local, &topic, &message, None) {
+                if keeper.on_output(Responder::Local, &topic, &message, OutputTiming::default()) {
                     keeper.robot.deliver(&topic, message);
                 } else if message.latching {
                     keeper.robot.on_latched_output(&topic, message);

@@ -44,7 +44,7 @@ const SETTLE: Duration = Duration::from_secs(3);
 /// Setup of the local original.
 #[derive(Debug, Clone)]
 pub struct OriginalSetup {
-    /// Its executable, arguments and environment; `None` if no original is installed.
+    /// Executable, arguments and environment; `None` if no original is installed.
     pub program: Option<OriginalProgram>,
     /// Absolute name of its node.
     pub node: String,
@@ -58,9 +58,9 @@ pub struct OriginalSetup {
 /// An event of the local original.
 #[derive(Debug)]
 pub enum OriginalEvent {
-    /// Its state has changed.
+    /// The state of the original has changed.
     State(LocalState),
-    /// Its process ended unexpectedly and will be restarted.
+    /// The process ended unexpectedly and will be restarted.
     Crashed(String),
     /// It published a message on this topic.
     Output(Arc<str>, SerializedMessage),

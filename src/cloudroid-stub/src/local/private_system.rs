@@ -15,14 +15,14 @@ use super::expected::ExpectedInterface;
 use super::lender::RobotLender;
 use super::private_domain::PrivateDomain;
 use super::private_master::PrivateMaster;
-use crate::seen;
+use crate::node_interface;
 
 /// Name of the stub's node in it.
 pub(super) const NODE: &str = "/cloudroid_stub";
 /// Topic that every ROS 2 node publishes.
 const EVENTS: &str = "/parameter_events";
 /// Time allowed for a node to disappear from the graph after its process has ended.
-const GONE: Duration = Duration::from_secs(5);
+const DISAPPEARANCE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A topic of a node, with its quality of service if known (ROS 2).
 pub type RegisteredTopic = (String, WireType, Option<QosProfile>);
@@ -155,7 +155,7 @@ impl PrivateSystem {
 
     /// Waits until a node of this name is registered.
     pub async fn wait_for_node(&self, node: &str) {
-        self.wait_until(|graph| seen::has_node(graph, node)).await;
+        self.wait_until(|graph| node_interface::has_node(graph, node)).await;
     }
 
     /// Returns the nodes of the process of `node`, in ROS 2 possibly several: no other process is here.
@@ -181,8 +181,8 @@ impl PrivateSystem {
         }
         let mut registered = RegisteredInterface::default();
         for topic in graph.topics.keys() {
-            let says = seen::publishes(&graph, node, topic);
-            let listens = seen::subscribes(&graph, node, topic);
+            let says = node_interface::publishes(&graph, node, topic);
+            let listens = node_interface::subscribes(&graph, node, topic);
             if !says && !listens {
                 continue;
             }
@@ -198,7 +198,7 @@ impl PrivateSystem {
             }
         }
         for service in graph.services.keys() {
-            if !seen::serves(&graph, node, service) {
+            if !node_interface::serves(&graph, node, service) {
                 continue;
             }
             if let Ok(service_type) = self.bus.service_type(service).await {
@@ -214,8 +214,8 @@ impl PrivateSystem {
             SystemBackend::Master(master) => master.process_exited().await,
             // Its ports are closed, which is detected after a moment.
             SystemBackend::Domain(_) => {
-                let gone = self.wait_until(|graph| !seen::has_node(graph, node));
-                if timeout(GONE, gone).await.is_err() {
+                let gone = self.wait_until(|graph| !node_interface::has_node(graph, node));
+                if timeout(DISAPPEARANCE_TIMEOUT, gone).await.is_err() {
                     tracing::warn!(node, "its process has ended, but its node is still visible");
                 }
             }
@@ -228,9 +228,9 @@ fn has_interface(graph: &Graph, nodes: &BTreeSet<String>, all: &ExpectedInterfac
     let any = |has: fn(&Graph, &str, &str) -> bool, name: &str| {
         !all.is_expected(name) || nodes.iter().any(|node| has(graph, node, name))
     };
-    let listens = |topic: &String| any(seen::subscribes, topic);
-    let says = |topic: &String| any(seen::publishes, topic);
-    let serves = |service: &String| any(seen::serves, service);
+    let listens = |topic: &String| any(node_interface::subscribes, topic);
+    let says = |topic: &String| any(node_interface::publishes, topic);
+    let serves = |service: &String| any(node_interface::serves, service);
     all.inputs.keys().all(listens) && all.outputs.iter().all(says) && all.services.iter().all(serves)
 }
 

@@ -15,13 +15,13 @@ use super::reconfigured;
 use super::service_use::ServiceUse;
 
 /// Largest number of requests that are kept; repeated changes of one parameter, as by a slider, count once.
-const MOST: usize = 256;
+const MAX_REQUESTS: usize = 256;
 /// Time allowed for a node to answer a request.
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 /// Offset of a message behind the CDR header.
 const BEGIN: usize = 4;
 /// Lifecycle states (`lifecycle_msgs/msg/State`) in which a node can be configured, and activated.
-const UNCONFIGURED: u8 = 1;
+const LIFECYCLE_UNCONFIGURED: u8 = 1;
 const INACTIVE: u8 = 2;
 
 /// The last settings of a node. A new setting may be made during a replay: for each service one of the two comes first,
@@ -37,7 +37,7 @@ pub type ServiceTurn = Option<OwnedMutexGuard<()>>;
 
 #[derive(Debug, Default)]
 struct RememberedState {
-    /// In the order of the requests.
+    /// Remembered values in the order of the requests.
     sets: Vec<RememberedSet>,
     /// Total number of requests.
     told: u64,
@@ -92,7 +92,7 @@ impl RememberedSettings {
             ServiceUse::Set => {
                 let target = set_target(request);
                 all.sets.retain(|known| known.service != service || known.target != target);
-                if all.sets.len() == MOST {
+                if all.sets.len() == MAX_REQUESTS {
                     all.sets.remove(0);
                 }
                 all.told += 1;
@@ -159,7 +159,7 @@ impl RememberedSettings {
             let states = step.service.replace("change_state", "get_state");
             let state = told(&states, EMPTY.into()).await;
             let from = match step.transition {
-                Transition::Configure => UNCONFIGURED,
+                Transition::Configure => LIFECYCLE_UNCONFIGURED,
                 _ => INACTIVE,
             };
             if state.is_some_and(|state| state.get(BEGIN) == Some(&from)) {
@@ -266,17 +266,17 @@ mod tests {
         }
         let sets = [set("min", 2), set("max", 3)].map(|it| ("/n/set_parameters".to_owned(), it));
         let way = [&steps[0], &steps[3]].map(|it| ("/n/change_state".to_owned(), it.clone()));
-        let everything = replayed_requests(&all, UNCONFIGURED).await;
+        let everything = replayed_requests(&all, LIFECYCLE_UNCONFIGURED).await;
         assert_eq!(everything, [&sets[..], &way[..]].concat());
         // Another client has already advanced the state.
         assert_eq!(replayed_requests(&all, 3).await, sets);
         all.record("/n/change_state", &ServiceUse::Transition, &change(2, "cleanup"));
-        assert_eq!(replayed_requests(&all, UNCONFIGURED).await, sets);
+        assert_eq!(replayed_requests(&all, LIFECYCLE_UNCONFIGURED).await, sets);
         for number in 0..1000 {
             let name = format!("p{number}");
             all.record("/n/set_parameters", &ServiceUse::Set, &set(&name, 0));
         }
-        assert_eq!(replayed_requests(&all, UNCONFIGURED).await.len(), MOST);
+        assert_eq!(replayed_requests(&all, LIFECYCLE_UNCONFIGURED).await.len(), MAX_REQUESTS);
     }
 
     #[tokio::test]

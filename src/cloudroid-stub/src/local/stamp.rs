@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     /// 3 s and 4 ns, in a ROS 2 header.
-    const STAMPED: [u8; 16] = [0, 1, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0];
+    const STAMPED_HEADER: [u8; 16] = [0, 1, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0];
 
     fn message(of: &WireType, bytes: &'static [u8]) -> SerializedMessage {
         SerializedMessage {
@@ -112,7 +112,7 @@ mod tests {
     fn stamps_of_ros_2_stand_behind_the_header_of_cdr() {
         let mut stamps = StampReader::default();
         let untold = ros2_type("p/msg/Found", "RIHS01_1", "");
-        let stamp = |stamps: &mut StampReader, of: &WireType| stamps.key(&message(of, &STAMPED));
+        let stamp = |stamps: &mut StampReader, of: &WireType| stamps.key(&message(of, &STAMPED_HEADER));
         assert_eq!(stamp(&mut stamps, &untold), None);
         // The publisher does not send the definition; the cloud does.
         let definition = "uint8 ALL=1\nstd_msgs/Header header\nstring<=8 name\n";
@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(stamp(&mut stamps, &image), Some(expected));
         let named = ros2_type("p/msg/Named", "RIHS01_3", "string<=8 name\nstd_msgs/Header h\n");
         assert!(!is_stamped(&named));
-        let cut = message(&image, &STAMPED[..8]);
+        let cut = message(&image, &STAMPED_HEADER[..8]);
         assert_eq!(stamps.key(&cut), None);
     }
 }

@@ -15,7 +15,7 @@ use tokio::time::timeout;
 
 use super::original::OriginalEvent;
 use super::process::OriginalProgram;
-use super::{Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer};
+use super::{Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, OutputTiming, PendingAnswer};
 use crate::testing::{SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type};
 
 stories! {
@@ -593,7 +593,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     let stopped = async {
         while heard != "stop" {
             keeper.on_input(&topic, string_message(ros, "x"));
-            keeper.on_cloud_output("/absolute/out", &string_message(ros, "cloud"), None);
+            keeper.on_cloud_output("/absolute/out", &string_message(ros, "cloud"), OutputTiming::default());
             // The answers of the original may be too late to be published.
             tokio::task::yield_now().await;
             while heard != "stop" {

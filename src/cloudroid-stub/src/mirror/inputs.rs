@@ -18,7 +18,7 @@ use super::state::{InputTopic, Inputs, Mirror, OpenChannel, TopicChannels};
 const QUEUE: usize = 256;
 
 /// Delay before a refused subscription is tried again.
-const REFUSED: Duration = Duration::from_secs(1);
+const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 impl Drop for InputTopic {
     fn drop(&mut self) {
@@ -203,7 +203,7 @@ async fn read_input(mirror: std::sync::Weak<Mirror>, wanted: RequestedInput, fee
             }
             Err(_) => {}
         }
-        tokio::time::sleep(REFUSED).await;
+        tokio::time::sleep(RETRY_DELAY).await;
     };
     let Some(refused) = mirror.upgrade().map(|mirror| {
         let dropped = Arc::clone(&subscription.dropped);

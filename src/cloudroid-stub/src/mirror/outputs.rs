@@ -42,9 +42,9 @@ impl Outputs {
                 publisher: topic.cloud.clone(),
                 latching: data.latching,
             };
-            let phases =
-                mirror.session().clock().and_then(|clock| reports::output_phases(&data, arrived, clock.offset));
-            heard = keeper.on_cloud_output(&topic.name, &message, phases);
+            let offset = mirror.session().clock().map(|clock| clock.offset);
+            let timing = reports::output_timing(&data, arrived, offset);
+            heard = keeper.on_cloud_output(&topic.name, &message, timing);
         }
         topic.on_message(Responder::Cloud, data.message, data.latching, heard);
     }

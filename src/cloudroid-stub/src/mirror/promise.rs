@@ -8,14 +8,14 @@ use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
-    Correlation, Failure, HandOver, LocalPolicy, Mode, QosEvent, QosSla, RequestId, RequestOutcome, Responder,
+    Correlation, Failure, HandOver, LocalPolicy, Measure, Mode, QosEvent, QosSla, RequestId, RequestOutcome, Responder,
     SafeStop, TopicPair, WarmStart,
 };
 use ros::bus::{Bus, SerializedMessage};
 use serde_json::json;
 
 use super::diagnostics::Diagnostics;
-use super::known::KnownInterface;
+use super::known_interface::KnownInterface;
 use super::reports::{self, Reports};
 use super::requests::RequestPattern;
 use super::safe_stop::{self, SafeStopPublisher};
@@ -122,7 +122,7 @@ impl Mirror {
             let original = Original::new(setting, interface, robot, self.call_limit);
             Some(original.await.context("the local original")?)
         };
-        let of_link = sla.is_link_based();
+        let (of_link, is_timed) = (sla.is_link_based(), sla.measure == Measure::Rrt);
         let way = Arc::new(MirrorAdapter(Arc::downgrade(self)));
         let stated = sla.answers.as_ref();
         let stated = stated.map(|pairs| pairs.iter().map(RequestPattern::from_pair).collect());
@@ -135,6 +135,7 @@ impl Mirror {
         let _ = self.promise.set(Promise {
             keeper: keeper.clone(),
             of_link,
+            is_timed,
             requests: stated.unwrap_or(decided),
             known: Mutex::default(),
             reports: Reports::default(),
@@ -165,11 +166,12 @@ impl Mirror {
             let types = known.inputs.values().chain(known.outputs.values());
             promise.keeper.learn_types(types);
             let mut pairs = known.pairs(&promise.requests);
-            if settled && pairs.is_empty() && !promise.requests.is_empty() && known.told.insert(String::new()) {
-                tracing::warn!(
-                    "this node has none of the request topics that the push found, so response times are not measured; \
-                        name them with request = \"/INPUT -> /OUTPUT\" in stub.toml"
-                );
+            if settled && pairs.is_empty() && promise.is_timed && known.told.insert(String::new()) {
+                let lacks = match promise.requests.as_slice() {
+                    [] => "the push found no request topics of this node, so only its calls and goals are timed",
+                    _ => "this node has none of the request topics that the push found, so they are not timed",
+                };
+                tracing::warn!("{lacks}; name them with request = \"/INPUT -> /OUTPUT\" in stub.toml");
             }
             if promise.of_link {
                 // A goal is executed by one side only; of all other messages, only those of the side that speaks count.
@@ -203,6 +205,8 @@ pub struct Promise {
     keeper: Arc<Keeper>,
     /// No time is promised: only the state of the link decides.
     of_link: bool,
+    /// Response times are promised.
+    is_timed: bool,
     /// Inputs and the outputs that answer them.
     requests: Vec<RequestPattern>,
     known: Mutex<KnownInterface>,

@@ -36,7 +36,7 @@ impl Refusals {
         let mut all: Vec<IncompatibleEndpoint> = known.values().flatten().cloned().collect();
         all.sort();
         all.dedup();
-        all.truncate(IncompatibleEndpoint::MOST);
+        all.truncate(IncompatibleEndpoint::MAX_ENDPOINTS);
         all
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use link::control::{Decision, FromRobot, RequestTiming};
+use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use qos::{DecisionReason, HandOver, Phases, QosEvent, RequestChannel, RequestOutcome, Responder};
@@ -13,6 +14,7 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use super::diagnostics::Diagnostics;
 use super::state::Mirror;
+use crate::local::OutputTiming;
 
 /// Interval between reports, the usual rate of `/diagnostics`.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -120,7 +122,7 @@ pub async fn report_loop(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
     let mut due = interval(PERIOD);
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
     // The session of the last report, and the number of messages that it had not sent.
-    let mut told = (Weak::new(), link::SkipCounts::default());
+    let mut told = (Weak::new(), [0; 2]);
     loop {
         due.tick().await;
         let Some(mirror) = mirror.upgrade() else {
@@ -135,13 +137,15 @@ pub async fn report_loop(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             if !requests.is_empty() {
                 session.send_control(&FromRobot::Requests(requests));
             }
-            let (of, dropped) = (Arc::downgrade(&session), session.skip_counts());
+            let (of, drops) = (Arc::downgrade(&session), session.drops());
+            let count = |cause| drops.iter().filter(|drop| drop.cause == cause).map(|drop| drop.count).sum();
+            let unsent @ [replaced, stale] = [count(Cause::Replaced), count(Cause::Stale)];
             if !Weak::ptr_eq(&told.0, &of) {
-                told = (of, link::SkipCounts::default());
+                told = (of, [0; 2]);
             }
-            if told.1 != dropped {
-                told.1 = dropped;
-                session.send_control(&FromRobot::Unsent { replaced: dropped.replaced, stale: dropped.stale });
+            if told.1 != unsent {
+                told.1 = unsent;
+                session.send_control(&FromRobot::Unsent { replaced, stale });
             }
             let decisions = promise.reports.take_decisions();
             if !decisions.is_empty() {
@@ -157,9 +161,17 @@ fn elapsed_between(from: i64, to: i64) -> Duration {
     Duration::from_nanos(u64::try_from(to.saturating_sub(from)).unwrap_or(0))
 }
 
+/// Returns the times of an output; its phases are known only with the `offset` of the cloud's clock.
+pub fn output_timing(data: &Data, arrived: i64, offset: Option<i64>) -> OutputTiming {
+    OutputTiming {
+        since_input: data.answered.map(|input| elapsed_between(input.born, arrived)),
+        phases: offset.and_then(|offset| output_phases(data, arrived, offset)),
+    }
+}
+
 /// Returns the phases of an input that an output may answer. `offset` is the cloud's clock minus the robot's, in
 /// nanoseconds.
-pub fn output_phases(data: &Data, arrived: i64, offset: i64) -> Option<Phases> {
+fn output_phases(data: &Data, arrived: i64, offset: i64) -> Option<Phases> {
     let input = data.answered?;
     let encoding = |microseconds: u32| Duration::from_micros(microseconds.into());
     let waited = elapsed_between(input.born, input.left).saturating_sub(encoding(input.serialise));

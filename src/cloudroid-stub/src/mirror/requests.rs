@@ -5,7 +5,7 @@
 use qos::{Correlation, TopicPair};
 use ros::remaps::Remaps;
 
-use super::known::KnownInterface;
+use super::known_interface::KnownInterface;
 use crate::local;
 use crate::revision::DecidedRequest;
 use crate::robot::LaunchedNode;

@@ -64,7 +64,7 @@ impl Mirror {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),
             services: registered.services.into_iter().map(serves).collect(),
-            nodes: (registered.nodes.iter()).map(|(node, names)| (node.clone(), names.clone().into())).collect(),
+            nodes: registered.nodes.clone(),
             ..Graph::default()
         };
         applied.nodes = registered.nodes;

@@ -148,7 +148,7 @@ impl Scene {
     async fn connect(&self) -> (JoinHandle<DisconnectReason>, JoinHandle<DisconnectReason>) {
         let (theirs, ours) = tokio::io::duplex(1 << 16);
         let hub = Arc::clone(&self.hub);
-        let served = tokio::spawn(async move { hub.serve(theirs, &[]).await });
+        let served = tokio::spawn(async move { hub.serve_until(theirs, &[], std::future::pending()).await });
         let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
         let (_, _, next) = self.mirror.session().position();
         let hello = Hello {

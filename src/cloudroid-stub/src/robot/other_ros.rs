@@ -9,13 +9,14 @@
 //! | `__name:=n`, `ROS_NAMESPACE` | `-r __node:=n`, `-r __ns:=/above` |
 //! | `_p:=base link` | `-p p:="base link"` |
 
+use ros::bus::parameter_names::spell_in_ros1;
 use ros::bus::{ParamValue, RosVersion};
 use ros::ros2::arguments::{BEGIN, END};
+use ros::ros2::parameters::yaml::{parse_any, parse_text};
 use ros::ros2::process;
 use ros::spelling::RespelledArguments;
 
 use super::{LaunchedNode, ros2};
-use crate::params_file::value;
 
 /// Returns the arguments of a robot's node for a program of the other ROS. What it cannot express is left out with a
 /// warning.
@@ -60,7 +61,7 @@ fn map_parameter(argument: &str, convert: fn(&str) -> String) -> String {
 
 /// Returns whether an argument of ROS 1 is a parameter that configures the stub.
 fn is_setting(argument: &str) -> bool {
-    argument.strip_prefix('_').is_some_and(|parameter| parameter.starts_with(&ros2::SETTINGS.replace('.', "/")))
+    argument.strip_prefix('_').is_some_and(|parameter| parameter.starts_with(&spell_in_ros1(ros2::SETTINGS)))
 }
 
 /// Returns the rules for the parts of the node's name that its program does not set in this way.
@@ -84,15 +85,14 @@ fn naming_rules(robot: &LaunchedNode) -> Vec<String> {
 
 /// Returns a value of ROS 1, where any text is one, in YAML as ROS 2 reads it.
 fn to_yaml(text: &str) -> String {
-    let value = value::parse_text(text).unwrap_or_else(|_| ParamValue::String(text.to_owned()));
-    process::yaml(&value)
+    process::yaml(&parse_any(text))
 }
 
 /// Returns a value in YAML as ROS 1 reads it. A text has no quotes, which roscpp would take for a part of it, unless it
 /// looks like another value; then only rospy, which reads YAML, takes it for a text.
 fn to_one_text(yaml: &str) -> String {
-    match value::parse_text(yaml) {
-        Ok(ParamValue::String(text)) if value::parse_text(&text).ok() == Some(ParamValue::String(text.clone())) => text,
+    match parse_text(yaml) {
+        Ok(ParamValue::String(text)) if parse_text(&text).ok() == Some(ParamValue::String(text.clone())) => text,
         _ => yaml.to_owned(),
     }
 }

@@ -6,11 +6,12 @@ use std::path::Path;
 use anyhow::bail;
 use ros::bus::{ParamValue, RosVersion};
 use ros::ros2::arguments::{self, BEGIN, CommandLinePart, END, Kind, RemapRule, RemapTarget};
+use ros::ros2::parameters::yaml::parse_text;
 use ros::ros2::{names, process};
 
 use super::{DefaultName, LaunchedNode, RosLocation};
 use crate::network::{self, Variable};
-use crate::params_file::{Sections, value};
+use crate::params_file::Sections;
 
 /// Prefix of parameters that are settings of the stub.
 pub const SETTINGS: &str = "cloudroid.";
@@ -77,7 +78,7 @@ fn read_sections(parts: &[CommandLinePart]) -> anyhow::Result<Sections> {
                     Some(node) => format!("/{node}"),
                     None => ALL.to_owned(),
                 };
-                let value = value::parse_text(&given.value);
+                let value = parse_text(&given.value);
                 let value = value.map_err(|problem| arguments::invalid_value(&part.words, &problem.reason))?;
                 sections.set(&nodes, given.name.clone(), value);
             }

@@ -48,23 +48,36 @@ pub fn read_password(stdin: bool) -> anyhow::Result<String> {
         }
         return Ok(password);
     }
+    let [password, again] = ask(["Password: ", "Repeat the password: "])?;
+    if password != again {
+        bail!("the passwords differ; nothing was changed");
+    }
+    Ok(password)
+}
+
+/// Reads a password that exists: prompts at the terminal, or reads the first line of standard input.
+pub fn read_existing_password(stdin: bool, prompt: &str) -> anyhow::Result<String> {
+    if stdin {
+        return read_password(true);
+    }
+    let [password] = ask([prompt])?;
+    Ok(password)
+}
+
+/// Asks at the terminal, without echo.
+fn ask<const N: usize>(prompts: [&str; N]) -> anyhow::Result<[String; N]> {
     let terminal = File::options()
         .read(true)
         .write(true)
         .open("/dev/tty")
         .context("no terminal to ask for a password; give it on standard input with --password-stdin")?;
-    let silent = EchoGuard::new(&terminal).context("cannot turn off the terminal's echo")?;
-    let asks = |words: &str| -> anyhow::Result<String> {
-        (&terminal).write_all(words.as_bytes())?;
-        Ok(first_line(&terminal)?)
-    };
-    let password = asks("Password: ")?;
-    let again = asks("Repeat the password: ")?;
-    drop(silent);
-    if password != again {
-        bail!("the passwords differ; nothing was changed");
+    let _silent = EchoGuard::new(&terminal).context("cannot turn off the terminal's echo")?;
+    let mut answers = [const { String::new() }; N];
+    for (prompt, answer) in prompts.into_iter().zip(&mut answers) {
+        (&terminal).write_all(prompt.as_bytes())?;
+        *answer = first_line(&terminal)?;
     }
-    Ok(password)
+    Ok(answers)
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ use crate::inside::{self, FoxgloveSession};
 use crate::output;
 
 /// Number of messages of a recording that are used, as by the daemon.
-pub const RECORDED: usize = 300;
+pub const MAX_RECORDED: usize = 300;
 /// Default number of requests, as by the daemon.
 pub const REQUESTS: usize = 40;
 /// Time allowed for one answer, and for all requests.

@@ -9,7 +9,7 @@ use super::probe::ProbeOutcome;
 use super::robot::RobotResources;
 
 /// Share of the recording's rate that must be reached, and of the requests that must be answered.
-const ENOUGH: f64 = 0.95;
+const MIN_SHARE: f64 = 0.95;
 /// Smallest number of answers for a meaningful 95th percentile.
 const FEWEST: usize = 10;
 
@@ -147,14 +147,14 @@ impl SideResult {
 
     /// Returns whether there are enough answers for the times to be meaningful.
     pub fn has_enough_answers(&self) -> bool {
-        self.answered >= FEWEST && self.answered as f64 >= self.requests as f64 * ENOUGH
+        self.answered >= FEWEST && self.answered as f64 >= self.requests as f64 * MIN_SHARE
     }
 
     /// Returns whether one request after the other keeps up with the recording's rate.
     pub fn keeps_pace(&self, pace: Option<f64>) -> bool {
         pace.is_none_or(|pace| {
             let possible = self.rrt.map_or(0.0, |rrt| 1000.0 / rrt.p50);
-            possible >= pace * ENOUGH
+            possible >= pace * MIN_SHARE
         })
     }
 }

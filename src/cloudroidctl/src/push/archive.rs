@@ -1,8 +1,8 @@
-//! The package as a request body: packed while it is sent, without a temporary file.
+//! Archives as request bodies: packed while they are sent, without a temporary file.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{SyncSender, sync_channel};
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
@@ -21,13 +21,19 @@ use crate::output;
 const CHUNK: usize = 256 << 10;
 const CHUNKS_AHEAD: usize = 8;
 
-/// Handle of the thread that packs the archive.
+/// Handle of who packs the archive.
 #[derive(Debug)]
 pub struct Packing {
     failure: std::sync::mpsc::Receiver<anyhow::Error>,
 }
 
 impl Packing {
+    /// Creates a handle, and where the error goes if packing fails.
+    pub fn channel() -> (SyncSender<anyhow::Error>, Packing) {
+        let (failed, failure) = sync_channel(1);
+        (failed, Packing { failure })
+    }
+
     /// Returns the error of packing, if it failed.
     pub fn into_error(self) -> Option<anyhow::Error> {
         self.failure.try_recv().ok()
@@ -71,8 +77,8 @@ impl PushSource {
 
     /// Returns it as a body.
     pub fn into_body(self) -> (RequestBody, Packing) {
-        let (chunks, received) = mpsc::channel(CHUNKS_AHEAD);
-        let (failed, failure) = sync_channel(1);
+        let (body, chunks) = new_body();
+        let (failed, packing) = Packing::channel();
         std::thread::spawn(move || {
             let (path, outcome) = match &self {
                 PushSource::Directory(path, selection) => (path, pack(selection, &chunks)),
@@ -87,17 +93,21 @@ impl PushSource {
                 let _ = chunks.blocking_send(Err(torn));
             }
         });
-        let frames =
-            futures_util::stream::unfold(
-                received,
-                |mut received| async move { Some((received.recv().await?, received)) },
-            );
-        let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
-        (body.boxed_unsync(), Packing { failure })
+        (body, packing)
     }
 }
 
-type Chunks = mpsc::Sender<io::Result<Bytes>>;
+/// Receiver of a body's chunks. An error ends the body with a failure.
+pub type Chunks = mpsc::Sender<io::Result<Bytes>>;
+
+/// Creates a body of chunks that are yet to come.
+pub fn new_body() -> (RequestBody, Chunks) {
+    let (chunks, received) = mpsc::channel(CHUNKS_AHEAD);
+    let frames =
+        futures_util::stream::unfold(received, |mut received| async move { Some((received.recv().await?, received)) });
+    let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
+    (body.boxed_unsync(), chunks)
+}
 
 /// Selects the files to send. Blocking.
 fn open_source(path: PathBuf) -> anyhow::Result<PushSource> {

@@ -14,7 +14,7 @@ const MAX_BYTES: u64 = 1 << 20;
 /// The ignore files that apply to a directory: its own and those of the directories above.
 #[derive(Debug, Clone, Default)]
 pub struct IgnoreRules {
-    /// From the root downwards.
+    /// Ignore files from the root downwards.
     files: Vec<Rc<IgnoreFile>>,
 }
 

@@ -12,16 +12,16 @@ use api::Size;
 use super::ignore::{IGNORE_FILE, IgnoreRules};
 
 /// Directories that never belong to a package.
-const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
+const EXCLUDED_DIRECTORIES: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
 /// Directories beside `src` of a workspace that catkin or colcon generate.
-const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
+const GENERATED_DIRECTORIES: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
 /// Size in bytes from which a file is named before it is sent.
 const LARGE: u64 = 100_000_000;
 /// Maximum number of large files that are named.
-const NAMED: usize = 10;
+const MAX_NAMED_FILES: usize = 10;
 /// Maximum numbers of files and of links to packages elsewhere, and maximum depth.
 const MAX_ENTRIES: usize = 1_000_000;
-const MAX_FOLLOWED: usize = 100;
+const MAX_LINKS: usize = 100;
 const MAX_DEPTH: usize = 64;
 /// Depth of the search for a package.xml behind a link.
 const PACKAGE_DEPTH: usize = 6;
@@ -68,13 +68,13 @@ pub fn select_files(root: &Path) -> anyhow::Result<Selection> {
     walk.add_directory(&place, &IgnoreRules::default())?;
     let SelectionWalk { mut selection, mut large, .. } = walk;
     large.sort_by_key(|(_, size)| std::cmp::Reverse(*size));
-    for (path, size) in large.iter().take(NAMED) {
+    for (path, size) in large.iter().take(MAX_NAMED_FILES) {
         let size = Size(*size);
         let text = format!("{} has {size} and is sent; a line in {IGNORE_FILE} leaves it out", path.display());
         selection.notes.push(text);
     }
-    if large.len() > NAMED {
-        selection.notes.push(format!("{} more files of over 100 MB are sent", large.len() - NAMED));
+    if large.len() > MAX_NAMED_FILES {
+        selection.notes.push(format!("{} more files of over 100 MB are sent", large.len() - MAX_NAMED_FILES));
     }
     Ok(selection)
 }
@@ -115,8 +115,8 @@ impl SelectionWalk {
         self.selection.has_package |= is_package;
         for entry in entries {
             let name = entry.file_name();
-            let is_left_out = LEFT_OUT.iter().any(|left_out| name == *left_out)
-                || (place.is_generated && MADE_OF_IT.iter().any(|made| name == *made))
+            let is_left_out = EXCLUDED_DIRECTORIES.iter().any(|left_out| name == *left_out)
+                || (place.is_generated && GENERATED_DIRECTORIES.iter().any(|made| name == *made))
                 || name == IGNORE_FILE;
             let inside = place.inside.join(&name);
             let kind = entry.file_type()?;
@@ -188,8 +188,8 @@ impl SelectionWalk {
             return Ok(());
         }
         ensure!(
-            self.followed.len() <= MAX_FOLLOWED,
-            "more than {MAX_FOLLOWED} links lead to packages elsewhere; push a workspace that has copies of them"
+            self.followed.len() <= MAX_LINKS,
+            "more than {MAX_LINKS} links lead to packages elsewhere; push a workspace that has copies of them"
         );
         let text = format!("{shown} is a link to {}, whose files are sent in its place", target.display());
         self.selection.notes.push(text);
@@ -222,7 +222,7 @@ fn holds_package(directory: &Path, depth: usize) -> bool {
     };
     depth > 0
         && entries.flatten().any(|entry| {
-            let is_skipped = LEFT_OUT.iter().any(|name| entry.file_name() == *name);
+            let is_skipped = EXCLUDED_DIRECTORIES.iter().any(|name| entry.file_name() == *name);
             let is_directory = entry.file_type().is_ok_and(|kind| kind.is_dir());
             !is_skipped && is_directory && holds_package(&entry.path(), depth - 1)
         })

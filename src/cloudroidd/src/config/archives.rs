@@ -11,7 +11,7 @@ use serde::Deserialize;
 pub struct ArchivesConfig(BTreeMap<String, Vec<String>>);
 
 /// Options that would make apt accept packages that are unsigned or signed by a weak key.
-const UNSIGNED: [&str; 4] = ["trusted=", "allow-insecure=", "allow-weak=", "allow-downgrade-to-insecure="];
+const INSECURE_OPTIONS: [&str; 4] = ["trusted=", "allow-insecure=", "allow-weak=", "allow-downgrade-to-insecure="];
 
 impl ArchivesConfig {
     pub fn check(&self) -> anyhow::Result<()> {
@@ -30,7 +30,7 @@ impl ArchivesConfig {
                             [signed-by=FILE] ADDRESS SUITE COMPONENT\""
                     );
                 }
-                if let Some(option) = UNSIGNED.iter().find(|option| line.contains(*option)) {
+                if let Some(option) = INSECURE_OPTIONS.iter().find(|option| line.contains(*option)) {
                     bail!("{option} for {base} would accept unsigned packages; name the key ring with signed-by=FILE");
                 }
             }

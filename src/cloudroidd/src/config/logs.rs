@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::Time;
 
 /// Least size of all logs: that of one servant, which is rotated once.
-const LEAST: u64 = 2 * servant::logs::ROTATE_AT;
+const MIN_TOTAL: u64 = 2 * servant::logs::ROTATE_AT;
 
 /// Logs of ended servants.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -37,10 +37,10 @@ impl LogsConfig {
 
     /// Checks the values.
     pub(super) fn check(&self) -> anyhow::Result<()> {
-        if self.servants == 0 || self.disk.0 < LEAST {
+        if self.servants == 0 || self.disk.0 < MIN_TOTAL {
             bail!(
                 "servants must be at least 1 and disk at least {}, the size of one log; for no logs write keep = 0",
-                Size(LEAST)
+                Size(MIN_TOTAL)
             );
         }
         Ok(())

@@ -40,16 +40,16 @@ impl Default for MemoryConfig {
 
 impl MemoryConfig {
     /// Smallest memory limit in bytes with which the daemon works.
-    const LEAST: u64 = 1 << 20;
+    const MIN_LIMIT: u64 = 1 << 20;
     const LEAST_FOR_A_SHIM: u64 = 32 << 20;
 
     pub(super) fn check(&self) -> anyhow::Result<()> {
-        let daemon = ("daemon", self.daemon.unwrap_or(self.client), Self::LEAST);
+        let daemon = ("daemon", self.daemon.unwrap_or(self.client), Self::MIN_LIMIT);
         let least = Self::LEAST_FOR_A_SHIM;
         for (name, size, least) in [
             daemon,
-            ("client", self.client, Self::LEAST),
-            ("servant", self.servant, Self::LEAST),
+            ("client", self.client, Self::MIN_LIMIT),
+            ("servant", self.servant, Self::MIN_LIMIT),
             ("shim", self.shim, least),
         ] {
             if size.0 < least {

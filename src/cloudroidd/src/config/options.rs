@@ -7,9 +7,9 @@ use choreographer::MemoryOptions;
 use super::{ClassConfig, Config, Controller, Hung, LoopbackRobots, NonFinite, PushConfig};
 use crate::machine;
 
-/// Default limit of the daemon's memory: one `PART`th (a quarter) of the machine's, and at most `MOST` bytes.
-const PART: u64 = 4;
-const MOST: u64 = 1 << 30;
+/// Default limit of the daemon's memory: a quarter of the machine's, and at most 1 GiB.
+const MEMORY_DIVISOR: u64 = 4;
+const MAX_DEFAULT_MEMORY: u64 = 1 << 30;
 
 impl Config {
     /// Returns the choreographer's options.
@@ -38,7 +38,7 @@ impl Config {
             hung_after: servant.hung_after,
             bridge: bridge_options(self),
             memory: MemoryOptions {
-                daemon: daemon.unwrap_or_else(|| (machine::usable_memory() / PART).min(MOST)),
+                daemon: daemon.unwrap_or_else(|| (machine::usable_memory() / MEMORY_DIVISOR).min(MAX_DEFAULT_MEMORY)),
                 client: memory.client.0,
                 servant: memory.servant.0,
                 unfinished: memory.unfinished.0,

@@ -1,7 +1,7 @@
 //! Error messages of the parser, translated into the terms of the configuration file.
 
 /// Texts in messages of `toml` and `serde` that name types, and their replacements.
-const WORDS: [(&str, &str); 14] = [
+const REPLACEMENTS: [(&str, &str); 14] = [
     ("expected usize", "expected a whole number, 0 or greater"),
     ("expected u64", "expected a whole number, 0 or greater"),
     ("expected u32", "expected a whole number, 0 or greater"),
@@ -21,7 +21,7 @@ const WORDS: [(&str, &str); 14] = [
 /// Returns an error message without the names of this program's types.
 pub(super) fn plain(message: &str) -> String {
     let mut text = message.to_owned();
-    for (theirs, ours) in WORDS {
+    for (theirs, ours) in REPLACEMENTS {
         text = text.replace(theirs, ours);
     }
     // A section's name in the message is its type's name in lower case.

@@ -2,9 +2,9 @@
 //!
 //! A file imports another if a `use` or a path in its code (`crate::a::b`, `super::a`, `self::a`, or `a::b` with a
 //! module or an imported name `a`) names something that the other defines. A name is followed through re-exports to
-//! the file that defines it; where that is not found, the module that was asked for it counts. `mod a;` and `pub use`
-//! are no imports: they say where a name is, and need nothing of it. Items with `#[cfg(test)]` are left out, and so are
-//! methods, whose files no path names.
+//! the file that defines it; where that is not found, the module that was asked for it counts. `mod a;`, `pub use` and
+//! the module in a visibility are no imports: they say where a name is, and need nothing of it. Items with
+//! `#[cfg(test)]` are left out, and so are methods, whose files no path names.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::{Path, PathBuf};
@@ -241,6 +241,8 @@ impl Modules {
                 ["#", "[", "cfg", "(", "test", ..] | ["#", "[", "cfg", "(", "all", "(", "test", ..] => {
                     item_length_after_attribute(rest)
                 }
+                // A visibility needs nothing of the module that it names.
+                ["pub", "(", "in", ..] => rest.iter().position(|token| *token == ")").unwrap_or(rest.len()),
                 ["mod", name, ";", ..] => {
                     let own = below.join(format!("{name}.rs"));
                     if own.exists() {
@@ -478,9 +480,11 @@ mod tests {
     #[test]
     fn tests_and_declarations_are_no_imports() {
         let circles = circles_of(&[
-            ("lib.rs", "mod a;\npub(crate) use a::A;\npub struct B;"),
+            ("lib.rs", "mod a;\nmod c;\npub(crate) use a::A;\npub struct B;"),
             ("a.rs", "use super::B;\npub struct A(B, char);\nfn f() -> char { '\"' }\nfn g<'a>(_: &'a str) {}\nmod b;"),
             ("a/b.rs", "#[cfg(test)]\nmod tests { use super::super::A; }\n#[cfg(test)]\nuse crate::a::A;\nfn f() {}"),
+            ("c.rs", "mod d;\nuse self::d::D;\nstruct C(D);"),
+            ("c/d.rs", "pub(in crate::c) struct D;"),
         ]);
         assert_eq!(circles, Vec::<Vec<String>>::new());
     }

@@ -30,10 +30,10 @@ impl BitWriter {
     /// Appends the low bits of every value, at most 32 of each, like [`BitWriter::put`] but without branches.
     #[inline]
     pub(crate) fn put_low(&mut self, values: &[u32], counts: &[u8]) {
-        const SOME: usize = 64;
+        const BATCH: usize = 64;
         let (mut pending, mut count) = (self.pending, self.count);
-        for (values, counts) in values.chunks(SOME).zip(counts.chunks(SOME)) {
-            let mut buffer = [0u8; SOME * 4 + 16];
+        for (values, counts) in values.chunks(BATCH).zip(counts.chunks(BATCH)) {
+            let mut buffer = [0u8; BATCH * 4 + 16];
             let mut written = 0;
             let mut put = |value: u64, bits: u32| {
                 pending |= value << count;

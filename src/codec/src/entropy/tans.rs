@@ -250,7 +250,7 @@ pub(crate) struct LaneReader<'a> {
 /// Number of symbols that may be decoded between two [`LaneReader::refill`]s: 56 bits are enough for five of eleven.
 pub(crate) const BATCH: usize = 4;
 /// Number of bits in a window after a refill.
-const FILLED: isize = 56;
+const REFILLED_BITS: isize = 56;
 
 impl<'a> LaneReader<'a> {
     fn new(bytes: &'a [u8], log: u32) -> Result<Self, Error> {
@@ -286,7 +286,7 @@ impl<'a> LaneReader<'a> {
             Some(word) => u64::from_le_bytes(*word),
             None => self.read_front(last),
         };
-        self.below = end - FILLED;
+        self.below = end - REFILLED_BITS;
         let spare = (last * 8 - end) as u32;
         Window { state: window.state, bits: (word << spare) & !0xff | 0x80 }
     }

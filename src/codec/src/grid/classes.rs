@@ -4,9 +4,9 @@ use super::cells::{CellCoder, CellModel, CellPosition};
 use crate::entropy::binary::AdaptiveBit;
 
 /// Values with a class of their own: unknown, free, occupied.
-const KNOWN: [u8; 3] = [255, 0, 100];
+const CLASS_VALUES: [u8; 3] = [255, 0, 100];
 /// Class of all other values.
-const OTHER: u8 = 3;
+const OTHER_CLASS: u8 = 3;
 
 /// Returns true if a grid has so many values besides the three known ones that it is better coded as shades.
 pub(super) fn has_many_shades(cells: &[u8], background: u8) -> bool {
@@ -14,17 +14,17 @@ pub(super) fn has_many_shades(cells: &[u8], background: u8) -> bool {
     for pair in cells.windows(2).step_by((cells.len() / 16_384).max(1)) {
         if pair != [background; 2] {
             told += 1;
-            others += usize::from(pair[0] != pair[1] && CLASSES[usize::from(pair[1])] == OTHER);
+            others += usize::from(pair[0] != pair[1] && CLASSES[usize::from(pair[1])] == OTHER_CLASS);
         }
     }
     others * 8 > told
 }
 
 const CLASSES: [u8; 256] = {
-    let mut classes = [OTHER; 256];
+    let mut classes = [OTHER_CLASS; 256];
     let mut class = 0;
-    while class < KNOWN.len() {
-        classes[KNOWN[class] as usize] = class as u8;
+    while class < CLASS_VALUES.len() {
+        classes[CLASS_VALUES[class] as usize] = class as u8;
         class += 1;
     }
     classes
@@ -91,10 +91,10 @@ fn code_value<S: CellCoder>(
     if !side.bit(&mut bits[0], known != guess) {
         return guess;
     }
-    if side.bit(&mut bits[1], CLASSES[usize::from(known)] == OTHER) {
+    if side.bit(&mut bits[1], CLASSES[usize::from(known)] == OTHER_CLASS) {
         return code_full_value(side, values, known);
     }
-    let mut candidates = KNOWN.into_iter().filter(|&value| value != guess);
+    let mut candidates = CLASS_VALUES.into_iter().filter(|&value| value != guess);
     let (first, second) = (candidates.next().unwrap_or(0), candidates.next().unwrap_or(0));
     if !side.bit(&mut bits[2], known != first) {
         return first;

@@ -13,7 +13,7 @@ use crate::entropy::binary::AdaptiveBit;
 use crate::wire::FrameCursor;
 
 /// Maximum number of values; grids with more are coded as pictures.
-pub(super) const MOST: usize = 64;
+pub(super) const MAX_VALUES: usize = 64;
 /// Maximum number of decisions of all contexts together: they take six bytes each, and a decoder has two MiB for
 /// tables.
 const BITS: usize = 330_000;
@@ -50,7 +50,7 @@ impl LadderValues {
 
     pub(super) fn read(input: &mut FrameCursor<'_>) -> Result<Self, Error> {
         let count = usize::from(input.byte()?);
-        if count == 0 || count > MOST {
+        if count == 0 || count > MAX_VALUES {
             return Err(Error::Corrupt("a grid of no values, or of too many"));
         }
         let pairs = input.take(2 * count)?.chunks_exact(2);
@@ -229,7 +229,7 @@ mod tests {
 
     #[test]
     fn tables_stay_below_two_megabytes() {
-        for count in 1..=MOST {
+        for count in 1..=MAX_VALUES {
             let values = LadderValues((0..count).map(|at| (at as u8, 4)).collect());
             let ladder = LadderModel::new(&values);
             assert!(ladder.bits.len() * size_of::<AdaptiveBit>() < (2 << 20) - (1 << 16), "{count}");

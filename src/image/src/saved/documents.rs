@@ -10,7 +10,7 @@ use crate::received::{MOST_LAYERS, blob_path, is_layout, parse_json, read, read_
 use crate::{Digest, Error, oci};
 
 /// Maximum number of lists in lists: an index of tags, one of architectures, and one to spare.
-const MOST_NESTED: usize = 3;
+const MAX_NESTED_LISTS: usize = 3;
 /// Maximum number of images in a layout, and of names in a message.
 const MOST_IMAGES: usize = 100;
 /// Maximum number of lists that are read: the entries of each may all name the same list, and so on.
@@ -117,7 +117,7 @@ impl SavedDocuments {
     fn read_layout(layout: &Tree) -> Result<Self, Error> {
         let index: SavedIndex = parse_json("index.json", &read(layout, "index.json")?)?;
         let mut found = FoundImages::default();
-        found.collect(layout, index, "", MOST_NESTED)?;
+        found.collect(layout, index, "", MAX_NESTED_LISTS)?;
         let images = found.images;
         if images.is_empty() {
             return Err(several_images(std::iter::empty()));

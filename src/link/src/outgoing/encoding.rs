@@ -5,69 +5,57 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::out::OutgoingRecord;
+use super::outgoing_record::OutgoingRecord;
 use crate::record::{ENCODED, FLAGS_AT, SERIALISE_AT};
 
 /// Minimum size of a message worth encoding, in bytes.
-const WORTH_IT: usize = 1024;
+const MIN_ENCODED_SIZE: usize = 1024;
 
 /// The message that is being encoded, and the channels whose messages may be encoded.
 #[derive(Debug, Default)]
 pub(crate) struct Encoding {
     /// Channels whose messages are encoded while it `pays`.
-    channels: BTreeSet<u32>,
-    pays: bool,
-    /// The message, and whether an encoder has taken it.
-    message: Option<(OutgoingRecord, bool)>,
-    done: Option<OutgoingRecord>,
+    pub(crate) channels: BTreeSet<u32>,
+    pub(crate) pays: bool,
+    message: Option<(OutgoingRecord, EncodingStage)>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum EncodingStage {
+    /// No encoder has taken it.
+    Waiting,
+    Taken,
+    /// It is encoded, and may be sent.
+    Done,
 }
 
 impl Encoding {
-    /// Allows messages of this channel to be encoded.
-    pub(crate) fn add(&mut self, channel: u32) {
-        self.channels.insert(channel);
-    }
-
-    /// No longer encodes messages of this channel.
-    pub(super) fn remove(&mut self, channel: u32) {
-        self.channels.remove(&channel);
-    }
-
-    #[cfg(test)]
-    pub(super) fn channels(&self) -> &BTreeSet<u32> {
-        &self.channels
-    }
-
-    /// Sets whether encoding is worthwhile.
-    pub(crate) fn set_enabled(&mut self, pays: bool) {
-        self.pays = pays;
-    }
-
     /// Returns whether this message is to be encoded.
     pub(super) fn should_encode(&self, out: &OutgoingRecord) -> bool {
         let flags = out.head.get(FLAGS_AT);
         self.pays
-            && out.payload.len() >= WORTH_IT
+            && out.payload.len() >= MIN_ENCODED_SIZE
             && flags.is_some_and(|flags| flags & ENCODED == 0)
             && out.channel.is_some_and(|channel| self.channels.contains(&channel))
     }
 
     pub(super) fn begin(&mut self, out: OutgoingRecord) {
-        self.message = Some((out, false));
+        self.message = Some((out, EncodingStage::Waiting));
     }
 
     /// Takes the message to be encoded now: its channel, its payload, and whether it must be decodable on its own.
     pub(crate) fn take(&mut self) -> Option<(u32, Bytes, bool)> {
-        let (out, taken) = self.message.as_mut().filter(|(_, taken)| !taken)?;
-        *taken = true;
+        let (out, stage) = self.message.as_mut().filter(|(_, stage)| *stage == EncodingStage::Waiting)?;
+        *stage = EncodingStage::Taken;
         Some((out.channel?, out.payload.clone(), out.each))
     }
 
     /// Stores the encoded message; `None`: it is sent unencoded.
     pub(crate) fn finish(&mut self, frame: Option<(Bytes, Duration)>) {
-        let Some((mut out, _)) = self.message.take() else {
+        let Some((out, stage)) = &mut self.message else {
             return;
         };
+        *stage = EncodingStage::Done;
         match frame {
             Some((frame, took)) => {
                 out.head[FLAGS_AT] |= ENCODED;
@@ -76,47 +64,30 @@ impl Encoding {
                 let plain = std::mem::replace(&mut out.payload, frame);
                 out.plain = out.each.then_some(plain);
             }
-            None => {
-                if let Some(channel) = out.channel {
-                    self.channels.remove(&channel);
-                }
-            }
+            None => self.channels.retain(|channel| out.channel != Some(*channel)),
         }
-        self.done = Some(out);
     }
 
-    /// Takes the encoded message, if it `may` be sent.
-    pub(super) fn take_encoded(&mut self, may: impl FnOnce(&mut OutgoingRecord) -> bool) -> Option<OutgoingRecord> {
-        self.done.take_if(may)
+    /// Returns the message that is being encoded, or is encoded and not yet sent.
+    pub(super) fn message(&self) -> Option<&OutgoingRecord> {
+        self.message.as_ref().map(|(out, _)| out)
     }
 
-    pub(super) fn has_encoded(&self) -> bool {
-        self.done.is_some()
+    /// Returns the message once it is encoded.
+    pub(super) fn encoded_message(&self) -> Option<&OutgoingRecord> {
+        let encoded = self.message.as_ref().filter(|(_, stage)| *stage == EncodingStage::Done);
+        encoded.map(|(out, _)| out)
     }
 
-    pub(super) fn is_busy(&self) -> bool {
-        self.message.is_some()
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        !self.has_encoded() && !self.is_busy()
-    }
-
-    /// Returns the message being encoded and the encoded one.
-    pub(super) fn messages(&self) -> impl Iterator<Item = &OutgoingRecord> {
-        self.message.iter().map(|(out, _)| out).chain(&self.done)
-    }
-
-    /// Removes both messages and returns them.
-    pub(super) fn drain(&mut self) -> impl Iterator<Item = OutgoingRecord> + use<> {
-        let message = self.message.take().map(|(out, _)| out);
-        message.into_iter().chain(self.done.take())
+    /// Takes the message, whether it is encoded or not.
+    pub(super) fn take_message(&mut self) -> Option<OutgoingRecord> {
+        self.message.take().map(|(out, _)| out)
     }
 
     /// Forgets a channel and returns whether an encoded message was discarded.
     pub(super) fn forget(&mut self, channel: u32) -> bool {
-        self.remove(channel);
-        let of_it = |out: &mut OutgoingRecord| out.channel == Some(channel);
-        self.done.take_if(of_it).is_some()
+        self.channels.remove(&channel);
+        let is_encoded = self.encoded_message().is_some_and(|out| out.channel == Some(channel));
+        is_encoded && self.take_message().is_some()
     }
 }

@@ -2,9 +2,9 @@
 
 use ros::ring::{Ring, RingBounds, RingItem};
 
-use super::out::OutgoingRecord;
+use super::outgoing_record::OutgoingRecord;
 use crate::control::FromCloud;
-use crate::limits::{ANSWERS, CALLS, CONTROL, LINES};
+use crate::limits::{ANSWERS, CALLS, CONTROL, LAST_LINES, LINES};
 use crate::record::Record;
 
 /// The queue to which a record belongs. One record of each lane (of the data lane: of each topic) is in flight at a
@@ -19,10 +19,17 @@ pub(super) enum RecordLane {
     Answers,
     /// Responses in several pieces.
     LongAnswers,
-    /// Topic messages.
-    Data,
     /// Lines printed by a node.
     Lines,
+    /// Topic messages, which have a queue per topic.
+    Data,
+}
+
+impl RecordLane {
+    /// Returns whether its records may be dropped. Those of other lanes count against a limit while they are queued.
+    pub(super) fn is_droppable(self) -> bool {
+        matches!(self, Self::Lines | Self::Data)
+    }
 }
 
 /// Share of lines on a busy link: one byte of lines per this many bytes of other records.
@@ -30,55 +37,43 @@ const LINES_SHARE: usize = 16;
 /// Maximum burst of lines in bytes after a time without any.
 const MOST_CREDIT: usize = 16 << 10;
 
-/// Records that are queued, in flight or unacknowledged.
+/// Records that are queued, in flight or unacknowledged; of the lanes of lines and messages, those that are sent again
+/// unless they are acknowledged.
 #[derive(Debug, Clone, Copy, Default)]
 struct LaneLoad {
     records: usize,
     bytes: usize,
 }
 
-/// The lanes of control messages, of calls and goals, and of responses.
-#[derive(Debug)]
+/// The lanes of control messages, of calls and goals, and of responses, whose records must be delivered; and that of
+/// lines, of which the oldest are omitted if there are too many, and which get a small share of a busy link.
+#[derive(Debug, Default)]
 pub(super) struct RecordLanes {
-    waiting: [Ring<OutgoingRecord>; 4],
-    loads: [LaneLoad; 4],
-}
-
-impl Default for RecordLanes {
-    fn default() -> Self {
-        Self { waiting: std::array::from_fn(|_| Ring::new_unbounded()), loads: Default::default() }
-    }
+    waiting: [Ring<OutgoingRecord>; 5],
+    /// Load of each lane, and of messages in several pieces.
+    loads: [LaneLoad; 7],
+    /// Bytes of lines that may be sent ahead of other queued records.
+    credit: usize,
 }
 
 impl RecordLanes {
-    /// Returns the load of a lane, the name of its records and its limit; both lanes of responses count together.
-    fn load(&self, lane: RecordLane) -> (LaneLoad, &'static str, RingBounds) {
-        let [control, calls, short, long] = self.loads;
-        match lane {
-            RecordLane::Control => (control, "orders", CONTROL),
-            RecordLane::Calls => (calls, "calls", CALLS),
-            _ => {
-                let both = LaneLoad { records: short.records + long.records, bytes: short.bytes + long.bytes };
-                (both, "answers", ANSWERS)
-            }
-        }
-    }
-
     /// Returns why another record of this size may not be kept in a lane.
     pub(super) fn overflow_reason(&self, lane: RecordLane, bytes: usize) -> Option<String> {
-        let (load, what, bounds) = self.load(lane);
-        let is_full = load.records >= bounds.messages || (load.records > 0 && load.bytes + bytes > bounds.bytes);
-        is_full.then(|| {
-            let LaneLoad { records, bytes } = load;
-            format!("{records} {what} of {bytes} bytes wait for it or are not acknowledged")
-        })
+        let (loads, what, bounds) = match lane {
+            RecordLane::Control => (&self.loads[..1], "orders", CONTROL),
+            RecordLane::Calls => (&self.loads[1..2], "calls", CALLS),
+            // Both lanes of responses count together.
+            _ => (&self.loads[2..4], "answers", ANSWERS),
+        };
+        let records: usize = loads.iter().map(|load| load.records).sum();
+        let kept: usize = loads.iter().map(|load| load.bytes).sum();
+        let is_full = records >= bounds.messages || (records > 0 && kept + bytes > bounds.bytes);
+        is_full.then(|| format!("{records} {what} of {kept} bytes wait for it or are not acknowledged"))
     }
 
     /// Queues a record; it is kept until it is acknowledged.
     pub(super) fn push(&mut self, out: OutgoingRecord) {
-        let load = &mut self.loads[out.lane as usize];
-        load.records += 1;
-        load.bytes += out.memory_size();
+        self.count(&out);
         self.waiting[out.lane as usize].append(out);
     }
 
@@ -87,17 +82,35 @@ impl RecordLanes {
         self.waiting[out.lane as usize].put_back(out);
     }
 
-    /// Releases a record that the peer has acknowledged.
-    pub(super) fn release(&mut self, out: &OutgoingRecord) {
-        if let Some(load) = self.loads.get_mut(out.lane as usize) {
-            load.records -= 1;
-            load.bytes -= out.memory_size();
-        }
+    fn load_mut(&mut self, out: &OutgoingRecord) -> &mut LaneLoad {
+        let is_big_message = out.lane == RecordLane::Data && out.is_big();
+        &mut self.loads[out.lane as usize + usize::from(is_big_message)]
     }
 
-    /// Returns the lane of the oldest record, among the first ones of all lanes that `may` be sent.
+    /// Counts a record until it is [released](Self::release).
+    pub(super) fn count(&mut self, out: &OutgoingRecord) {
+        let load = self.load_mut(out);
+        load.records += 1;
+        load.bytes += out.memory_size();
+    }
+
+    /// Releases a record that the peer has acknowledged, or that is queued again.
+    pub(super) fn release(&mut self, out: &OutgoingRecord) {
+        let load = self.load_mut(out);
+        load.records -= 1;
+        load.bytes -= out.memory_size();
+    }
+
+    /// Returns the bytes of lines and small messages, and of big messages, that are not acknowledged.
+    pub(super) fn unacknowledged_bytes(&self) -> (usize, usize) {
+        let [.., lines, small, big] = self.loads;
+        (lines.bytes + small.bytes, big.bytes)
+    }
+
+    /// Returns the lane of the oldest record that must be delivered, among the first ones of their lanes that `may` be
+    /// sent.
     pub(super) fn first_ready(&self, may: impl Fn(&OutgoingRecord) -> bool) -> Option<RecordLane> {
-        let firsts = self.waiting.iter().filter_map(Ring::front);
+        let firsts = self.waiting[..RecordLane::Lines as usize].iter().filter_map(Ring::front);
         let first = firsts.filter(|out| may(out)).min_by_key(|out| out.order)?;
         Some(first.lane)
     }
@@ -106,16 +119,9 @@ impl RecordLanes {
         self.waiting[lane as usize].pop()
     }
 
-    /// Returns the order number of the next control record.
-    pub(super) fn next_control(&self) -> Option<u64> {
-        let first = self.waiting[RecordLane::Control as usize].front();
-        first.map(|out| out.order)
-    }
-
-    /// Returns whether a goal of this channel is queued.
-    pub(super) fn has_goal(&self, channel: u32) -> bool {
-        let mut calls = self.waiting[RecordLane::Calls as usize].iter();
-        calls.any(|out| out.channel == Some(channel))
+    /// Returns the queued records of a lane.
+    pub(super) fn records_of(&self, lane: RecordLane) -> impl Iterator<Item = &OutgoingRecord> {
+        self.waiting[lane as usize].iter()
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -124,47 +130,39 @@ impl RecordLanes {
 
     /// Returns the number of bytes kept in all lanes.
     pub(super) fn bytes(&self) -> usize {
-        self.loads.iter().map(|load| load.bytes).sum()
+        let lines = self.waiting[RecordLane::Lines as usize].bytes();
+        lines + self.loads.iter().map(|load| load.bytes).sum::<usize>()
     }
-}
 
-/// The lines printed by a node: the oldest are omitted if there are too many, and they get a small share of a busy
-/// link.
-#[derive(Debug)]
-pub(super) struct LineQueue {
-    waiting: Ring<OutgoingRecord>,
-    /// Bytes of lines that may be sent ahead of other queued records.
-    credit: usize,
-}
-
-impl Default for LineQueue {
-    fn default() -> Self {
-        Self { waiting: Ring::new_unbounded(), credit: 0 }
+    pub(super) fn push_line(&mut self, line: OutgoingRecord) {
+        self.waiting[RecordLane::Lines as usize].append(line);
+        self.omit_lines(LINES);
     }
-}
 
-impl LineQueue {
-    pub(super) fn push(&mut self, line: OutgoingRecord) {
-        self.waiting.append(line);
+    /// Takes the newest lines; the others are omitted.
+    pub(super) fn take_last_lines(&mut self) -> Ring<OutgoingRecord> {
+        self.omit_lines(LAST_LINES);
+        std::mem::take(&mut self.waiting[RecordLane::Lines as usize])
+    }
+
+    /// Omits the oldest lines beyond a limit.
+    fn omit_lines(&mut self, limit: RingBounds) {
+        let lines = &mut self.waiting[RecordLane::Lines as usize];
         let mut left_out = 0;
-        while self.waiting.exceeds(LINES) {
-            left_out += self.waiting.pop().map_or(0, |oldest| oldest.line_count());
+        while lines.exceeds(limit) {
+            left_out += lines.pop().map_or(0, |oldest| oldest.line_count());
         }
-        self.note_omitted(left_out);
-    }
-
-    /// Queues a line that was not received, in front of the others.
-    pub(super) fn put_back(&mut self, line: OutgoingRecord) {
-        self.waiting.put_back(line);
+        self.note_omitted_lines(left_out);
     }
 
     /// Notes that lines in front of the queue are omitted, so that the peer is told.
-    pub(super) fn note_omitted(&mut self, lines: i64) {
-        if lines > 0 {
-            let told = self.waiting.front().is_some_and(|first| first.is_required());
-            let told = told.then(|| self.waiting.pop()).flatten();
+    pub(super) fn note_omitted_lines(&mut self, count: i64) {
+        let lines = &mut self.waiting[RecordLane::Lines as usize];
+        if count > 0 {
+            let told = lines.front().is_some_and(|first| first.is_required());
+            let told = told.then(|| lines.pop()).flatten();
             let more = told.map_or(0, |told| told.line_count());
-            self.waiting.put_back(OutgoingRecord::omission_notice(lines + more));
+            lines.put_back(OutgoingRecord::omission_notice(count + more));
         }
     }
 
@@ -173,23 +171,14 @@ impl LineQueue {
         self.credit = (self.credit + bytes / LINES_SHARE).min(MOST_CREDIT);
     }
 
-    /// Takes the next line, if it `may` be sent. `is_alone`: nothing else can be sent.
-    pub(super) fn take(&mut self, is_alone: bool, may: impl Fn(&OutgoingRecord) -> bool) -> Option<OutgoingRecord> {
-        let first = self.waiting.front().filter(|out| may(out))?;
-        let length = first.len().min(MOST_CREDIT);
+    /// Takes the next line, if its share allows that. `is_alone`: nothing else can be sent.
+    pub(super) fn take_line(&mut self, is_alone: bool) -> Option<OutgoingRecord> {
+        let length = self.records_of(RecordLane::Lines).next()?.len().min(MOST_CREDIT);
         if !is_alone && length > self.credit {
             return None;
         }
         self.credit = self.credit.saturating_sub(length);
-        self.waiting.pop()
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.waiting.is_empty()
-    }
-
-    pub(super) fn bytes(&self) -> usize {
-        self.waiting.bytes()
+        self.take(RecordLane::Lines)
     }
 }
 

@@ -1,12 +1,13 @@
 use std::time::Duration;
 
+use ::budget::Budget;
 use bytes::Bytes;
 use proptest::prelude::*;
 
 use super::*;
 use crate::incoming::Incoming;
 use crate::limits::{ANSWERS, CALLS};
-use crate::record::Data;
+use crate::record::{Call, Data};
 
 fn data(channel: u32, born: i64, size: usize) -> Record {
     Record::Data(Data {
@@ -79,7 +80,7 @@ fn after_four_billion_records_every_one_still_comes_once() {
     }
     assert_eq!(incoming.progress().number, first + 7);
     out.acknowledge(incoming.progress().number);
-    assert!(out.retransmit.len() == 0, "the peer has them all");
+    assert!(out.retransmit.is_empty(), "the peer has them all");
     // The connection is lost with more in flight: one record was received, one was not.
     for number in 8..10 {
         out.push(&control(number), DeliveryMode::Each);
@@ -111,6 +112,23 @@ fn a_big_message_does_not_hold_up_small_ones() {
 }
 
 #[test]
+fn on_a_slow_link_a_command_waits_for_a_piece_of_a_picture_alone() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    // 600 kbit/s, on which the picture takes 0.4 s.
+    out.set_throughput(75e3);
+    out.push(&data(1, 1, 30_000), DeliveryMode::Newest);
+    let begin = out.next(0).unwrap();
+    assert!(matches!(&begin, Frame::Begin { bytes, .. } if bytes.len() <= 4096), "{begin:?}");
+    assert_eq!(deliver(&mut incoming, begin), None);
+    out.push(&data(2, 2, 10), DeliveryMode::Newest);
+    let mut came = Vec::new();
+    while let Some(frame) = out.next(0) {
+        came.extend(born_time(deliver(&mut incoming, frame)));
+    }
+    assert_eq!(came, [2, 1]);
+}
+
+#[test]
 fn a_flood_of_small_ones_does_not_stop_a_big_one() {
     let mut out = Outgoing::new(None);
     out.push(&data(1, 1, 200_000), DeliveryMode::Newest);
@@ -130,14 +148,16 @@ fn newest_wins_among_big_ones_and_old_ones_are_not_sent() {
     }
     assert_eq!(drop_count(&out, 1, Cause::Replaced), 4);
     for n in 0..5 {
-        out.push(&data(2, n * 50, 10), DeliveryMode::Newest);
+        out.push(&data(2, n * 50, 2000), DeliveryMode::Newest);
+        // Commands are small, and all of them are sent.
+        out.push(&data(3, n * 50 + 1, 10), DeliveryMode::Newest);
     }
     let mut incoming = Incoming::default();
     let mut came: Vec<i64> =
         std::iter::from_fn(|| out.next(250)).filter_map(|frame| born_time(deliver(&mut incoming, frame))).collect();
     assert_eq!(drop_count(&out, 2, Cause::Stale), 3, "those of 0, 50 and 100");
     came.sort_unstable();
-    assert_eq!(came, [4, 150, 200]);
+    assert_eq!(came, [1, 4, 51, 101, 150, 151, 200, 201]);
 }
 
 #[test]
@@ -188,7 +208,7 @@ fn acknowledged_records_are_released() {
     out.acknowledge(1);
     assert_eq!(out.retransmit.len(), 1);
     out.acknowledge(2);
-    assert_eq!((out.retransmit.len(), out.retransmit.bytes), (0, 0));
+    assert_eq!((out.retransmit.len(), out.lanes.bytes()), (0, 0));
 }
 
 proptest! {
@@ -200,7 +220,8 @@ proptest! {
     ) {
         let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
         for (n, size) in sizes.iter().enumerate() {
-            out.push(&Record::Call { id: n as u32, service: 0, request: vec![0; *size].into() }, DeliveryMode::Each);
+            let call = Call { id: n as u32, service: 0, request: vec![0; *size].into() };
+            out.push(&Record::Call(call), DeliveryMode::Each);
             out.push(&data(7, n as i64, size % 1000), DeliveryMode::Each);
         }
         let (mut calls, mut messages) = (Vec::new(), Vec::new());
@@ -212,7 +233,7 @@ proptest! {
                 let Some(frame) = out.next(0) else { break };
                 if n + 1 == frames { break }
                 match deliver(&mut incoming, frame) {
-                    Some(Record::Call { id, .. }) => calls.push(id),
+                    Some(Record::Call(Call { id, .. })) => calls.push(id),
                     Some(Record::Data(data)) => messages.push(data.born),
                     _ => {}
                 }
@@ -231,8 +252,8 @@ proptest! {
 
 fn encoding_outgoing() -> Outgoing {
     let mut out = Outgoing::new(None);
-    out.encoding.add(1);
-    out.encoding.set_enabled(true);
+    out.encoding.channels.insert(1);
+    out.encoding.pays = true;
     out
 }
 
@@ -280,15 +301,14 @@ fn a_message_that_came_damaged_goes_once_more_and_leaves_nothing() {
     out.encoding.finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
     assert!(out.next(0).is_some());
     assert!(out.resend_damaged(1, 1) && !out.resend_damaged(1, 1));
-    out.encoding.set_enabled(false);
+    out.encoding.pays = false;
     let mut incoming = Incoming::default();
     incoming.reconnect(2);
     let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).collect();
     let mut came = frames.into_iter().map(|frame| deliver(&mut incoming, frame));
     assert_eq!(came.find_map(born_time), Some(1));
     out.acknowledge(out.next_number() - 1);
-    let kept = &out.retransmit;
-    assert_eq!((kept.len(), kept.bytes, kept.big), (0, 0, 0));
+    assert_eq!((out.retransmit.len(), out.lanes.bytes()), (0, 0));
 }
 
 #[test]
@@ -391,7 +411,7 @@ fn a_big_latched_message_that_was_cut_off_comes_again() {
 fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
     let mut out = Outgoing::new(None);
     let close = control(7);
-    out.encoding.add(1);
+    out.encoding.channels.insert(1);
     for number in 1..=3 {
         out.push(&data(1, number, 10 * number as usize), DeliveryMode::Each);
     }
@@ -416,7 +436,7 @@ fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
     assert!(out.closed.is_empty(), "the peer has not said that it has it");
     out.acknowledge(incoming.received_numbers().0);
     assert_eq!(out.closed, [1]);
-    assert!(out.topics.is_empty() && out.encoding.channels().is_empty() && out.retransmit.len() == 0);
+    assert!(out.topics.is_empty() && out.encoding.channels.is_empty() && out.retransmit.is_empty());
 }
 
 fn answer(size: usize) -> Record {
@@ -429,14 +449,14 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         let mut out = Outgoing::new(None);
         let mut pushed = 0;
         // The peer reads everything immediately.
-        while out.overflow_reason().is_none() {
+        while out.overflow_reason.is_none() {
             assert!(pushed <= ANSWERS.messages, "{pushed} answers of {size} bytes");
             out.push(&answer(size), DeliveryMode::Each);
             while out.next(0).is_some() {}
             pushed += 1;
         }
         assert!(pushed * size <= ANSWERS.bytes + size);
-        let reason = out.overflow_reason().unwrap().to_owned();
+        let reason = out.overflow_reason.clone().unwrap();
         assert!(reason.contains("not acknowledged"), "{reason}");
         // Further records are not kept any more.
         let held = out.lanes.bytes();
@@ -450,7 +470,7 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         out.next(0).unwrap();
         out.acknowledge(out.next_number() - 1);
     }
-    assert_eq!((out.overflow_reason(), out.lanes.bytes()), (None, 0));
+    assert_eq!((out.overflow_reason.as_deref(), out.lanes.bytes()), (None, 0));
 }
 
 #[test]
@@ -477,7 +497,7 @@ fn goals_beyond_the_limit_are_dropped_and_counted() {
     for number in 0..CALLS.messages as i64 + 3 {
         out.push(&data(1, number, 10), DeliveryMode::InOrder);
     }
-    assert_eq!((out.overflow_reason(), drop_count(&out, 1, Cause::Full)), (None, 3));
+    assert_eq!((out.overflow_reason.as_deref(), drop_count(&out, 1, Cause::Full)), (None, 3));
 }
 
 #[test]
@@ -494,7 +514,8 @@ fn what_is_longer_than_the_peer_takes_is_left_out_and_counted() {
 #[test]
 fn limits_without_which_nothing_could_be_sent_are_not_believed() {
     let mut out = Outgoing::new(None);
-    out.set_limits(LinkLimits { record: 0, under_way: 0, under_way_bytes: 0, ahead: 0 });
+    out.set_limits(LinkLimits { record: 0, under_way: 0, under_way_bytes: 0, ahead: 0, told: 0 });
+    assert_eq!(out.peer_limits().told, crate::MAX_CONTROL);
     out.push(&control(1), DeliveryMode::Each);
     out.push(&data(1, 1, 100_000), DeliveryMode::Each);
     assert!(out.next(0).is_some() && out.next(0).is_some());
@@ -540,7 +561,7 @@ fn a_flood_of_calls_does_not_stop_messages() {
 fn what_waits_counts_and_beyond_the_budget_messages_go_before_answers_do() {
     let budget = Budget::new("servant x", 8 << 20);
     let mut out = Outgoing::new(None);
-    out.set_budget(&budget);
+    out.permit = Some(budget.permit());
     for born in 0..20 {
         for channel in 0..8 {
             out.push(&data(channel, born, 1 << 20), DeliveryMode::Each);
@@ -549,16 +570,16 @@ fn what_waits_counts_and_beyond_the_budget_messages_go_before_answers_do() {
     assert!((6 << 20..=8 << 20).contains(&budget.used_bytes()), "{budget:?}");
     let lost: u64 = out.dropped.iter().map(|(.., count)| count).sum();
     assert!(lost >= 20 * 8 - 8, "{:?}", out.dropped);
-    assert_eq!(out.overflow_reason(), None);
+    assert_eq!(out.overflow_reason.as_deref(), None);
     out.push(&answer(3 << 20), DeliveryMode::Each);
-    let reason = out.overflow_reason().expect("there is no room for it").to_owned();
+    let reason = out.overflow_reason.clone().expect("there is no room for it");
     assert!(reason.contains("the memory for servant x"), "{reason}");
 
     drop(out);
 
     // In flight, kept, and put back.
     let mut out = Outgoing::new(None);
-    out.set_budget(&budget);
+    out.permit = Some(budget.permit());
     assert_eq!(budget.used_bytes(), 0);
     for _ in 0..100 {
         out.push(&answer(2 << 20), DeliveryMode::Each);
@@ -567,5 +588,57 @@ fn what_waits_counts_and_beyond_the_budget_messages_go_before_answers_do() {
         out.acknowledge(out.next_number() - 1);
         assert_eq!(budget.used_bytes(), 0);
     }
-    assert_eq!(out.overflow_reason(), None);
+    assert_eq!(out.overflow_reason.as_deref(), None);
+}
+
+#[test]
+fn the_newest_lines_come_before_the_last_order() {
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    for number in 0..=255 {
+        out.push_line(&control(number));
+    }
+    out.push_last(&control(0));
+    // Nothing passes it, and nothing is left.
+    out.push(&control(1), DeliveryMode::Each);
+    let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).collect();
+    let came: Vec<Record> = frames.into_iter().filter_map(|frame| deliver(&mut incoming, frame)).collect();
+    let Some(Record::Control(notice)) = came.first() else {
+        panic!("{came:?}");
+    };
+    assert!(String::from_utf8_lossy(notice).contains("[128 lines"), "{notice:?}");
+    let last: Vec<Record> = (128..=255).chain([0, 1]).map(control).collect();
+    assert_eq!(came[1..], last);
+}
+
+/// Returns the number of lines that a record is or tells of as omitted.
+fn count_lines(record: Record) -> u64 {
+    let Record::Control(text) = record else {
+        panic!("{record:?}");
+    };
+    let text = String::from_utf8_lossy(&text);
+    let omitted = text.split('[').nth(1).and_then(|text| text.split(' ').next());
+    omitted.map_or(1, |count| count.parse().unwrap())
+}
+
+#[test]
+fn lines_that_are_lost_unkept_are_told_of() {
+    const PRINTED_LINES: u64 = 90;
+    let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
+    out.set_limits(LinkLimits { ahead: 256, ..LinkLimits::default() });
+    let line = Record::Control(vec![b'x'; 30_000].into());
+    let mut lost = Vec::new();
+    for _ in 0..PRINTED_LINES {
+        out.push_line(&line);
+        lost.extend(out.next(0));
+    }
+    assert!(lost.iter().all(|frame| matches!(frame, Frame::Whole { number: 1.., .. })), "each can be missed");
+    assert_eq!(lost.len(), 256 / UNKEPT_AHEAD, "the others wait");
+    out.reconnect(0, &[]);
+    incoming.reconnect(out.next_number());
+    let mut came = 0;
+    while !out.is_empty() {
+        came += out.next(0).and_then(|frame| deliver(&mut incoming, frame)).map_or(0, count_lines);
+        out.acknowledge(incoming.progress().number);
+    }
+    assert_eq!(came, PRINTED_LINES, "lines, and those that were told of");
 }

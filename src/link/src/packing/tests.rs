@@ -2,7 +2,7 @@ use super::*;
 
 fn codec_pair() -> (SessionCodecs, SessionCodecs) {
     let (mut robot, cloud) = (SessionCodecs::default(), SessionCodecs::default());
-    robot.set_peer_codecs(&supported_codecs(|_| false));
+    robot.set_peer_codecs(&supported_codecs(|_| false), None);
     robot.add(1, Schema::OccupancyGrid);
     (robot, cloud)
 }
@@ -21,8 +21,8 @@ fn grid(wall: usize) -> Bytes {
 
 fn encode(packing: &mut SessionCodecs, wall: usize, alone: bool) -> Bytes {
     let job = packing.encode_job(1, grid(wall), alone, Some(1e5)).unwrap();
-    let packed = job.run();
-    packing.finish(packed)
+    let packed = job();
+    packing.finish(packed).0
 }
 
 #[test]
@@ -32,11 +32,11 @@ fn a_message_that_is_being_encoded_when_its_connection_is_lost_spoils_none_after
         let job = robot.encode_job(1, grid(wall), false, Some(1e5)).unwrap();
         // Every fifth job is abandoned: its connection is lost, and its encoder with it.
         if wall % 5 == 0 {
-            drop(job.run());
+            drop(job());
             robot.reconnect();
             continue;
         }
-        let frame = robot.finish(job.run());
+        let frame = robot.finish(job()).0;
         let (message, answer) = cloud.decode(1, &frame);
         assert!(message.unwrap() == grid(wall), "{wall}");
         if let Some(answer) = answer {
@@ -68,8 +68,7 @@ fn pictures_lose_detail_only_where_both_ends_say_so() {
     let video = names(|codec| codec == Codec::Video).contains(&"video".to_owned());
     assert_eq!(video, Codec::Video.is_available());
     let mut robot = SessionCodecs::new(Some(Duration::from_millis(400)));
-    robot.set_quality(Some(50));
-    robot.set_peer_codecs(&names(|codec| codec == Codec::Jpeg));
+    robot.set_peer_codecs(&names(|codec| codec == Codec::Jpeg), Some(50));
     assert_eq!(robot.lossy, Some(Codec::Jpeg));
     robot.add(1, Schema::Image);
     // On a link that needs a second for an uncompressed image, the fastest lossless codec takes longer than T_max
@@ -77,7 +76,7 @@ fn pictures_lose_detail_only_where_both_ends_say_so() {
     let mut used = Vec::new();
     for number in 0..60 {
         let job = robot.encode_job(1, noisy(number), false, Some(60e3)).unwrap();
-        let frame = robot.finish(job.run());
+        let frame = robot.finish(job()).0;
         used.push(codec::peek(&frame).unwrap().codec);
         let (message, _) = SessionCodecs::default().decode(1, &frame);
         assert_eq!(message.unwrap().len(), noisy(number).len());
@@ -108,7 +107,7 @@ fn encoding_pays_where_the_link_is_slow_and_the_peer_decodes() {
     assert!(!robot.is_worthwhile(Some(1e9)) && !robot.is_worthwhile(None));
     assert!(!cloud.is_worthwhile(Some(2.5e6)), "it was not told what its peer decodes");
     let mut old = SessionCodecs::default();
-    old.set_peer_codecs(&["raw".to_owned(), "zstd".to_owned()]);
+    old.set_peer_codecs(&["raw".to_owned(), "zstd".to_owned()], None);
     assert!(!old.is_worthwhile(Some(2.5e6)));
 }
 

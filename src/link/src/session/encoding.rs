@@ -6,9 +6,10 @@ use tokio::task::JoinHandle;
 
 use super::{Session, State};
 use crate::Error;
-use crate::control::{self, Control, ControlMessage, SessionMessage};
+use crate::control::{self, ControlMessage, SessionMessage};
 use crate::frame::Frame;
-use crate::incoming::limit_error;
+use crate::incoming::check_limit;
+use crate::outgoing::DeliveryMode;
 use crate::packing::EncodedMessage;
 use crate::record::Data;
 
@@ -23,49 +24,35 @@ impl<O: ControlMessage> Session<O> {
             self.wake.notify_one();
             return None;
         };
-        Some(tokio::task::spawn_blocking(move || job.run()))
+        Some(tokio::task::spawn_blocking(job))
     }
 
     pub(super) fn finish_encoding(&self, packed: Option<EncodedMessage>) {
         let state = &mut *self.state.lock();
-        let frame = packed.map(|packed| {
-            let took = packed.took;
-            (state.packing.finish(packed), took)
-        });
-        state.out.encoding.finish(frame);
+        state.out.encoding.finish(packed.map(|packed| state.packing.finish(packed)));
     }
 
     /// Decodes a message. If that fails, returns the frame to send to the peer immediately, if any.
-    pub(super) fn decode_message(&self, mut data: Data) -> Result<Data, Option<Frame>> {
+    pub(super) fn decode_message(&self, data: Data) -> Result<Data, Option<Frame>> {
         if !data.encoded {
             return Ok(data);
         }
         let channel = data.channel;
         let (message, answer) = self.state.lock().packing.decode(channel, &data.message);
         let error = match message {
-            Ok(message) => {
-                data.message = message;
-                data.encoded = false;
-                return Ok(data);
-            }
+            Ok(message) => return Ok(Data { message, encoded: false, ..data }),
             Err(error) => error,
         };
-        match answer {
-            Some(ReceiverFeedback::Keyframe) => {
-                tracing::debug!(channel, %error, "a message cannot be decoded");
-                self.request_keyframe(channel);
-                Err(None)
-            }
-            Some(ReceiverFeedback::Damaged) => {
-                tracing::warn!(channel, %error, "a message arrived damaged");
-                let born = data.born;
-                Err(Some(Frame::Damaged { channel, born }))
-            }
-            None => {
-                tracing::debug!(channel, %error, "a message cannot be decoded");
-                Err(None)
-            }
+        if answer == Some(ReceiverFeedback::Damaged) {
+            tracing::warn!(channel, %error, "a message arrived damaged");
+            return Err(Some(Frame::Damaged { channel, born: data.born }));
         }
+        tracing::debug!(channel, %error, "a message cannot be decoded");
+        if answer == Some(ReceiverFeedback::Keyframe) {
+            self.control_record(&SessionMessage::Keyframe { channel })
+                .inspect(|ask| self.push(ask, DeliveryMode::Each));
+        }
+        Err(None)
     }
 
     /// Handles a message that arrived damaged at the peer: its topic is no longer encoded with that codec.
@@ -82,19 +69,14 @@ impl<O: ControlMessage> Session<O> {
     /// Parses a control record. Returns `None` for a message between the sessions, which is handled here. The record is
     /// charged to `held` before it is parsed.
     pub(super) fn parse_control(&self, json: &[u8], held: &mut Permit) -> Result<Option<O::FromPeer>, Error> {
-        let limit = control::max_control_length(json);
-        if json.len() > limit {
-            return Err(limit_error("a control record", json.len(), limit));
-        }
+        check_limit("a control record", json.len(), control::max_control_length(json))?;
         held.resize(JsonWeight::estimate(json).bytes)?;
-        match Control::read(json) {
-            Ok(Control::Order(order)) => return Ok(Some(order)),
-            Ok(Control::Between(SessionMessage::Keyframe { channel })) => {
-                let packing = &mut self.state.lock().packing;
-                packing.on_answer(channel, ReceiverFeedback::Keyframe);
-            }
-            Err(error) => tracing::debug!(%error, "the other end sent something unknown"),
+        // The name comes first in the JSON, so a message of the other type is recognized immediately.
+        if let Ok(SessionMessage::Keyframe { channel }) = serde_json::from_slice(json) {
+            self.state.lock().packing.on_answer(channel, ReceiverFeedback::Keyframe);
+            return Ok(None);
         }
-        Ok(None)
+        let order = serde_json::from_slice(json);
+        Ok(order.inspect_err(|error| tracing::debug!(%error, "the other end sent something unknown")).ok())
     }
 }

@@ -68,7 +68,7 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
     let serving = cloud.clone();
     tokio::spawn(async move {
         while let Some(record) = calls.recv().await {
-            if let Record::Call { id, request, .. } = record {
+            if let Record::Call(Call { id, request, .. }) = record {
                 serving.answer(id, 0, Ok(request));
             }
         }
@@ -170,7 +170,7 @@ async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
         let asking = async {
             for _ in 0..20 {
                 let id = robot.call(1, Bytes::from_static(b"asked"));
-                let Some(Record::Call { id: asked, .. }) = calls.recv().await else {
+                let Some(Record::Call(Call { id: asked, .. })) = calls.recv().await else {
                     panic!("a call should come");
                 };
                 cloud.answer(asked, 0, Ok(Bytes::new()));
@@ -292,7 +292,7 @@ async fn a_call_is_not_lost_when_a_welcome_is() {
     tokio::select! {
         lost = robot.run(&mut at_robot, &to_robot) => panic!("{lost}"),
         lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
-        call = calls.recv() => assert!(matches!(call, Some(Record::Call { .. })), "{call:?}"),
+        call = calls.recv() => assert!(matches!(call, Some(Record::Call(_))), "{call:?}"),
         () = tokio::time::sleep(Duration::from_secs(60)) => panic!("the call was lost"),
     }
 }
@@ -318,8 +318,8 @@ fn picture(number: u8) -> Bytes {
 async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     let (robot, cloud) = (session(), session());
     let codecs = crate::packing::supported_codecs(|_| false);
-    robot.set_peer_codecs(&codecs);
-    cloud.set_peer_codecs(&codecs);
+    robot.set_peer_codecs(&codecs, None);
+    cloud.set_peer_codecs(&codecs, None);
     robot.open_channel(1, "/image", codec::Schema::Image);
     open(&robot, &cloud);
     let (near, mut slow) = duplex(1 << 12);
@@ -349,14 +349,14 @@ async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
         for number in 0..=255 {
             let mut picture_data = data(1, 0);
             picture_data.message = picture(number);
-            let before = robot.traffic().0;
+            let before = robot.state.lock().out.sent;
             robot.publish(picture_data, DeliveryMode::Newest);
             let Some(Record::Data(came)) = records.recv().await else {
                 panic!("a picture should come");
             };
             assert_eq!(came.message, picture(number));
             assert!(!came.encoded, "the handler has messages, not frames");
-            encoded += u32::from(robot.traffic().0 - before < 57_600 / 4);
+            encoded += u32::from(robot.state.lock().out.sent - before < 57_600 / 4);
             if encoded > 3 {
                 return;
             }
@@ -397,11 +397,11 @@ impl SessionHandler<FromCloud> for CountingHandler {
 #[tokio::test]
 async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_again() {
     let (robot, cloud) = (session(), session());
-    robot.set_peer_codecs(&crate::packing::supported_codecs(|_| false));
+    robot.set_peer_codecs(&crate::packing::supported_codecs(|_| false), None);
     robot.open_channel(1, "/map", codec::Schema::OccupancyGrid);
     open(&robot, &cloud);
     // As on a slow link.
-    robot.state.lock().out.encoding.set_enabled(true);
+    robot.state.lock().out.encoding.pays = true;
     let (near, mut damaging) = duplex(1 << 16);
     let (mut beyond, far) = duplex(1 << 16);
     let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);
@@ -521,6 +521,17 @@ async fn parameters_are_read_if_what_they_become_has_room() {
     assert_eq!((kept, full.limit), (0, MAX_TOLD));
 }
 
+#[test]
+fn what_takes_more_memory_than_the_peer_gives_is_not_sent() {
+    let told = || FromRobot::Parameters(vec![("x".repeat(1 << 20), None)]);
+    for (room, is_sent) in [(MAX_TOLD, true), (2 << 20, false)] {
+        let robot = session();
+        robot.set_peer_limits(LinkLimits { told: room, ..LinkLimits::default() });
+        robot.send_control(&told());
+        assert_eq!(!robot.state.lock().out.is_empty(), is_sent, "{room}");
+    }
+}
+
 #[tokio::test]
 async fn a_hello_is_read_if_what_it_becomes_has_room() {
     let (mut at_robot, mut at_cloud) = sockets();
@@ -530,7 +541,7 @@ async fn a_hello_is_read_if_what_it_becomes_has_room() {
     for (limit, is_read) in [(64 << 20, true), (4 << 20, false)] {
         at_robot.queue(ws::frame::BINARY, Frame::Open(hello.clone()).encode());
         let mut held = budget.child("hello", limit).permit();
-        let hello = receive_open::<_, crate::control::Hello>(&mut at_cloud, "hello", &mut held);
+        let hello = receive_open::<crate::control::Hello>(&mut at_cloud, "hello", &mut held);
         let (sent, hello) = tokio::join!(poll_fn(|cx| at_robot.poll_flush(cx)), hello);
         sent.expect("sent");
         match hello {

@@ -27,7 +27,7 @@ pub(super) struct Counters {
     pub(super) bytes: u64,
     /// Bytes sent.
     pub(super) sent: u64,
-    /// Nothing more was queued.
+    /// True if the queue was empty.
     pub(super) idle: bool,
 }
 

@@ -122,11 +122,11 @@ fn a_message_that_others_hold_is_not_changed_under_them() {
 #[test]
 fn memory_is_bounded() {
     let skew = skew_ahead();
-    for second in 0..3 * REMEMBERED {
+    for second in 0..3 * MAX_STAMPS {
         let message = stamped_message(1_700_000_000 + u32::try_from(second).unwrap(), 0);
         skew.apply(Direction::In, &header(), message);
     }
-    let known = skew.known.lock();
-    assert_eq!(known.robots.found.len(), REMEMBERED);
-    assert_eq!(known.robots.order.len(), REMEMBERED);
+    let [robots, _] = &*skew.known.lock();
+    assert_eq!(robots.found.len(), MAX_STAMPS);
+    assert_eq!(robots.order.len(), MAX_STAMPS);
 }

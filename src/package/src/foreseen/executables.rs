@@ -27,7 +27,7 @@ const MAX_SETUP: usize = 64 << 10;
 const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
 
 /// Words of build files of ROS 1 without which no program is installed as such.
-const WAYS_OF_ONE: [&str; 7] =
+const ROS1_INSTALL_WORDS: [&str; 7] =
     ["add_executable", "catkin_install_python", "PROGRAMS", "TARGETS", "DIRECTORY", "include", "add_subdirectory"];
 
 /// Keywords that end the list of targets in `install(TARGETS …)`.
@@ -76,7 +76,7 @@ pub(super) fn scan_package(root: &Path, package: &Package, version: RosVersion) 
         reading.shown.programs.clear();
         reading.shown.launch_directories.clear();
         reading.shown.launch_files.clear();
-    } else if version == RosVersion::One && !WAYS_OF_ONE.iter().any(|word| reading.shown.text.contains(word)) {
+    } else if version == RosVersion::One && !ROS1_INSTALL_WORDS.iter().any(|word| reading.shown.text.contains(word)) {
         // Of a package that installs no program, those in its share directory are found.
         let scripts = scripts::find_scripts(&root.join(&package.path)).into_iter();
         let scripts = scripts.filter(|script| script.is_executable && scripts::is_shared(&script.path));

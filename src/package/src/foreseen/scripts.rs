@@ -7,12 +7,12 @@ use foreign::Visit;
 use rustix::fs::FileType;
 
 /// Maximum number of scripts of a package.
-const MOST: usize = 1000;
+const MAX_SCRIPTS: usize = 1000;
 /// Directories whose files are for builds, tests or people.
-const LEFT_OUT: [&str; 11] =
+const EXCLUDED_DIRECTORIES: [&str; 11] =
     ["build", "devel", "install", "test", "tests", "doc", "docs", "cfg", "cmake", "launch", "__pycache__"];
 /// Directories of a ROS 1 package whose files are installed only if its build files state so.
-const NOT_SHARED: [&str; 10] =
+const UNINSTALLED_DIRECTORIES: [&str; 10] =
     ["build", "devel", "install", "test", "tests", "doc", "docs", "include", "__pycache__", "cmake"];
 /// Directories whose scripts are programs even if they are not executable.
 const PLACES: [&str; 3] = ["scripts", "nodes", "bin"];
@@ -41,10 +41,10 @@ pub(super) fn find_scripts(directory: &Path) -> Vec<Script> {
         let name = entry.name().to_string_lossy();
         let is_root = entry.path.as_os_str().is_empty();
         match entry.kind() {
-            FileType::Directory if !is_root && (name.starts_with('.') || LEFT_OUT.contains(&&*name)) => {
+            FileType::Directory if !is_root && (name.starts_with('.') || EXCLUDED_DIRECTORIES.contains(&&*name)) => {
                 return Ok(Visit::Skip);
             }
-            FileType::RegularFile if found.len() < MOST => {}
+            FileType::RegularFile if found.len() < MAX_SCRIPTS => {}
             _ => return Ok(Visit::Into),
         }
         let is_executable = entry.stat.st_mode & 0o100 != 0;
@@ -69,7 +69,7 @@ pub(super) fn is_shared(path: &Path) -> bool {
     path.components().all(|part| match part {
         Component::Normal(name) => {
             let name = name.to_string_lossy();
-            !name.starts_with('.') && !NOT_SHARED.contains(&&*name)
+            !name.starts_with('.') && !UNINSTALLED_DIRECTORIES.contains(&&*name)
         }
         _ => false,
     })

@@ -2,7 +2,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-const STAMPED: [&str; 9] = [
+const STAMPED_TYPES: [&str; 9] = [
     "sensor_msgs/Image",
     "sensor_msgs/LaserScan",
     "sensor_msgs/CameraInfo",
@@ -33,7 +33,7 @@ fn interface_of_nodes(topics: &[(&str, &str)]) -> Interface {
     define("std_msgs/Header", header);
     for (topic, _) in topics {
         let (_, type_name) = topic.split_once(' ').expect("a type");
-        let text = if STAMPED.contains(&type_name) { "std_msgs/Header header\n" } else { "int32 x\n" };
+        let text = if STAMPED_TYPES.contains(&type_name) { "std_msgs/Header header\n" } else { "int32 x\n" };
         define(type_name, text);
     }
     for (topic, node) in topics {

@@ -15,7 +15,7 @@ const MAX_BYTES: u64 = 1 << 20;
 const MAX_FILES: usize = 50_000;
 const MAX_TOTAL: u64 = 256 << 20;
 /// Directories whose files are not used by a running node.
-const LEFT_OUT: [&str; 6] = [".git", "doc", "docs", "test", "tests", "__pycache__"];
+const EXCLUDED_DIRECTORIES: [&str; 6] = [".git", "doc", "docs", "test", "tests", "__pycache__"];
 /// Files that mention packages without using them; of a package.xml the dependencies are known.
 const PROSE: [&str; 3] = [".rst", ".md", "package.xml"];
 
@@ -62,7 +62,7 @@ impl<'a> MentionReader<'a> {
         let walked = foreign::walk(&directory, |entry| {
             let name = entry.name().to_string_lossy();
             match entry.kind() {
-                FileType::Directory if LEFT_OUT.contains(&&*name) => return Ok(Visit::Skip),
+                FileType::Directory if EXCLUDED_DIRECTORIES.contains(&&*name) => return Ok(Visit::Skip),
                 FileType::RegularFile if entry.stat.st_size as u64 <= MAX_BYTES => {}
                 _ => return Ok(Visit::Into),
             }

@@ -17,7 +17,7 @@ const SETUP_ZSH: &str = include_str!("inside/setup.zsh");
 const ENVIRONMENT: [&str; 5] = [".sh", ".bash", ".zsh", ".ps1", ".dsv"];
 
 /// Terms of ROS 2.
-pub(super) const WORDS: RosTerms = RosTerms {
+pub(super) const TERMS: RosTerms = RosTerms {
     run: "ros2 run",
     order: "because the workspace that is sourced last is searched first",
     plugins: "Components of this package cannot be loaded into\na container that runs on the robot",

@@ -9,7 +9,7 @@ const SETUP_BASH: &str = include_str!("inside/setup.bash");
 const SETUP_ZSH: &str = include_str!("inside/setup.zsh");
 
 /// Terms of ROS 1.
-pub(super) const WORDS: RosTerms = RosTerms {
+pub(super) const TERMS: RosTerms = RosTerms {
     run: "rosrun",
     order: "because sourcing another catkin workspace removes it again",
     plugins: "Nodelets of this package cannot be loaded into a\nmanager that runs on the robot",

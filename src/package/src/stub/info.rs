@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use ros::bus::RosVersion;
 
-use super::contents::Content;
+use super::package_files::Content;
 use crate::interface::Interface;
 
 /// Address of the portal for robots.
@@ -79,7 +79,7 @@ pub(super) struct RosTerms {
     pub(super) order: &'static str,
     /// Description of what cannot be loaded on the robot.
     pub(super) plugins: &'static str,
-    /// Where a robot may give a setting besides `stub.toml`.
+    /// Places besides `stub.toml` where a robot may give a setting.
     pub(super) settings: &'static str,
 }
 

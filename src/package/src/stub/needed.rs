@@ -4,7 +4,7 @@
 /// Top-level directories of a package that only its author needs.
 const DIRECTORIES: [&str; 5] = ["include", "cmake", "build", "devel", "debian"];
 /// Directories in which launch files may find what they read besides sources and test data.
-const MIXED: [&str; 3] = ["src", "test", "tests"];
+const SEARCHED_DIRECTORIES: [&str; 3] = ["src", "test", "tests"];
 /// Suffixes of files that are read by launch files.
 const READ: [&str; 11] =
     [".launch", ".xml", ".yaml", ".yml", ".json", ".urdf", ".xacro", ".srdf", ".sdf", ".rviz", ".test"];
@@ -27,7 +27,7 @@ pub fn is_needed(path: &str, executable: bool) -> bool {
     let ends = |endings: &[&str]| endings.iter().any(|ending| name.ends_with(ending));
     executable
         || !(DIRECTORIES.contains(&top)
-            || MIXED.contains(&top) && !ends(&READ)
+            || SEARCHED_DIRECTORIES.contains(&top) && !ends(&READ)
             || NAMES.contains(&name)
             || ends(&ENDINGS))
 }

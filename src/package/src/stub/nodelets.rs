@@ -14,7 +14,7 @@ pub(super) fn plugin_lists(share: &BTreeMap<String, Content>) -> BTreeSet<String
     let Ok(text) = std::str::from_utf8(bytes) else {
         return BTreeSet::new();
     };
-    let Ok(document) = roxmltree::Document::parse(text) else {
+    let Ok(document) = crate::xml::parse(text) else {
         return BTreeSet::new();
     };
     document
@@ -34,7 +34,7 @@ pub(super) fn unloadable_plugin_list(about: &StubInfo<'_>, content: Content) -> 
     };
     let text = String::from_utf8_lossy(bytes);
     // A list that is not XML loads nothing either.
-    let Ok(document) = roxmltree::Document::parse(&text) else {
+    let Ok(document) = crate::xml::parse(&text) else {
         return content;
     };
     let mut list = format!(

@@ -8,7 +8,7 @@ use std::ops::Bound;
 use std::path::Path;
 
 use ros::bus::RosVersion;
-use roxmltree::{Document, Node};
+use roxmltree::Node;
 
 use super::nodelets::{self, escape_xml};
 use super::{Content, Contents, StubInfo, ament};
@@ -85,7 +85,7 @@ fn launch_file_ros(path: &str, bytes: &[u8]) -> Option<RosVersion> {
     }
     let usual = is_launch.then_some(RosVersion::One);
     let text = std::str::from_utf8(bytes).unwrap_or_default();
-    let Ok(document) = Document::parse(text) else {
+    let Ok(document) = crate::xml::parse(text) else {
         return usual;
     };
     if !document.root_element().has_tag_name("launch") {

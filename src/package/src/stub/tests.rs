@@ -174,7 +174,7 @@ fn no_placeholder_is_left_and_the_same_input_gives_the_same_files() {
 fn nodelets_name_a_library_that_says_why() {
     let files = compose_stub(&["node"]);
     let list = text(&files["share/p/nodelets.xml"]);
-    let document = roxmltree::Document::parse(list).expect("XML");
+    let document = crate::xml::parse(list).expect("XML");
     let library = document.root_element();
     assert!(library.attribute("path").is_some_and(|path| path.starts_with("p runs in the cloud")));
     let class = library.children().find(|node| node.is_element()).expect("a class");

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use ros::bus::RosVersion;
+use ros::ros2::middleware;
 
 use super::view::View;
 use super::{FoundSystem, RosSpace};
@@ -12,10 +13,8 @@ use crate::Error;
 
 /// Search path of every distribution.
 const PATH: &str = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin";
-/// Middlewares that speak RTPS, as the daemon does, in order of preference.
-pub const MIDDLEWARES: [&str; 3] = ["rmw_fastrtps_cpp", "rmw_cyclonedds_cpp", "rmw_fastrtps_dynamic_cpp"];
 /// Variables of an image that are about where it ran or how it was built.
-const DROPPED: [&str; 17] = [
+const DROPPED_VARIABLES: [&str; 17] = [
     "AMENT_CURRENT_PREFIX",
     "COLCON_PREFIX_PATH",
     "CYCLONEDDS_URI",
@@ -68,7 +67,9 @@ pub fn make_environment<L: AsRef<Path>>(
     }
     let mut environment: BTreeMap<String, String> = given
         .iter()
-        .filter(|(name, value)| is_variable(name) && !value.contains('\0') && !DROPPED.contains(&name.as_str()))
+        .filter(|(name, value)| {
+            is_variable(name) && !value.contains('\0') && !DROPPED_VARIABLES.contains(&name.as_str())
+        })
         .map(|(name, value)| (name.clone(), value.clone()))
         .collect();
     for name in LISTS {
@@ -101,13 +102,21 @@ pub fn make_environment<L: AsRef<Path>>(
     if system.ros == RosVersion::Two {
         // Python packages of ROS start Python once more, to set LD_LIBRARY_PATH, unless this says that it is set.
         set("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1");
-        let own = given.get("RMW_IMPLEMENTATION").filter(|name| MIDDLEWARES.contains(&name.as_str()));
-        match own.map(String::as_str).or(system.first_package(&MIDDLEWARES)) {
-            Some(name) => set("RMW_IMPLEMENTATION", name),
-            None => environment.remove("RMW_IMPLEMENTATION"),
+        match choose_middleware(system, given) {
+            Some(name) => set(middleware::VARIABLE, name),
+            None => environment.remove(middleware::VARIABLE),
         };
     }
     Ok(environment)
+}
+
+/// Returns the middleware of the nodes of a system of ROS 2: the one that the image sets (`given`), if the bus speaks
+/// it and it is there, else the first of those that are there.
+pub fn choose_middleware<'a>(system: &FoundSystem, given: &'a BTreeMap<String, String>) -> Option<&'a str> {
+    let own = given.get(middleware::VARIABLE).map(String::as_str);
+    let own = own.filter(|name| middleware::SUPPORTED.contains(name));
+    let there = own.and_then(|name| system.first_package(&[name]));
+    there.or_else(|| system.first_package(&middleware::SUPPORTED)).or(own)
 }
 
 /// Returns whether a text is the name of a variable that a shell can have, and not one that makes the loader load

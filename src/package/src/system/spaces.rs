@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use ros::bus::RosVersion;
 
 use super::view::View;
-use super::{HIDDEN, LARGEST_TEXT, SystemError};
+use super::{HIDDEN_DIRECTORIES, LARGEST_TEXT, SystemError};
 use crate::install_space::{INDEX, MARKER};
 use crate::{Error, names};
 
@@ -17,11 +17,11 @@ const MOST_DIRECTORIES: usize = 5000;
 const MOST_SPACES: usize = 64;
 /// Maximum number of packages of a space.
 const MOST_PACKAGES: usize = 5000;
-/// Where no workspace is, at the root.
+/// Directories at the root that contain no workspace.
 const SYSTEM: [&str; 14] =
     ["bin", "boot", "dev", "etc", "lib", "lib32", "lib64", "libx32", "proc", "run", "sbin", "sys", "tmp", "var"];
 /// Directories of workspaces with other content than install spaces.
-const SKIPPED: [&str; 6] = ["build", "log", "logs", "node_modules", "src", "share"];
+const SKIPPED_DIRECTORIES: [&str; 6] = ["build", "log", "logs", "node_modules", "src", "share"];
 /// Distribution's name of Debian's own ROS 1, which is of the time of Noetic.
 const OF_DEBIAN: &str = "noetic";
 
@@ -114,7 +114,7 @@ pub(super) fn find_spaces(view: &View, environment: &BTreeMap<String, String>) -
                 0 => SYSTEM.contains(&name.as_str()),
                 // Of /usr only what is not the distribution's.
                 1 if path == "/usr" => name != "local",
-                _ => SKIPPED.contains(&name.as_str()) || name.starts_with('.'),
+                _ => SKIPPED_DIRECTORIES.contains(&name.as_str()) || name.starts_with('.'),
             };
             let below = format!("{path}/{name}");
             if !skipped && view.has_directory(&below)? {
@@ -171,7 +171,7 @@ fn look_at(view: &View, path: &str, found: &mut FoundSpaces) -> Result<bool, Err
         found.unusable.push((show_path(path), "has a name with special characters"));
         return Ok(true);
     }
-    if HIDDEN.iter().any(|hidden| path == *hidden || path.starts_with(&format!("{hidden}/"))) {
+    if HIDDEN_DIRECTORIES.iter().any(|hidden| path == *hidden || path.starts_with(&format!("{hidden}/"))) {
         found.unusable.push((path.to_owned(), "is hidden by scratch space in containers; install it below /opt"));
         return Ok(true);
     }
@@ -213,7 +213,7 @@ fn read_packages(view: &View, path: &str, layout: SpaceLayout) -> Result<BTreeMa
 
 /// Returns the version in a package.xml.
 fn read_version(text: &str) -> Option<String> {
-    let document = roxmltree::Document::parse(text).ok()?;
+    let document = crate::xml::parse(text).ok()?;
     let version = document.root_element().children().find(|part| part.has_tag_name("version"))?;
     let plain = |c: &char| c.is_ascii_alphanumeric() || ".+-~".contains(*c);
     Some(version.text()?.trim().chars().take_while(plain).take(64).collect())

@@ -84,7 +84,7 @@ fn an_image_of_ros_2_is_known_by_its_index() {
     assert_eq!(packages.keys().collect::<Vec<_>>(), ["gone", "nav2_msgs", "rclpy", "rmw_fastrtps_cpp"]);
     assert_eq!(packages["nav2_msgs"], "1.3.4");
     assert!(found.has_any(&["cmake"]) && !found.has_any(&["g++", "colcon"]));
-    assert!(found.dpkg_status.is_some_and(|status| status.starts_with("Package: a")));
+    assert_eq!(found.debian, Some(make_variables(&[("a", "1")])));
 
     let given = [("PATH", "/usr/bin:/opt/tool/bin"), ("ROS_DOMAIN_ID", "7"), ("LD_PRELOAD", "/x"), ("MY_MODEL", "a b")];
     let environment = root.make_environment(&given);
@@ -107,6 +107,27 @@ fn an_image_of_ros_2_is_known_by_its_index() {
     for name in ["ROS_DOMAIN_ID", "LD_PRELOAD", "ROS_PACKAGE_PATH"] {
         assert_eq!(environment.get(name), None, "{name}");
     }
+}
+
+#[test]
+fn nodes_use_a_middleware_that_is_there_and_spoken() {
+    let root = RootFixture::new_ubuntu();
+    root.write_ament("1", "opt/ros/kilted", "rclpy", "9.1.2");
+    let chosen = |given: &str| {
+        let environment = root.make_environment(&[("RMW_IMPLEMENTATION", given)]);
+        environment.get("RMW_IMPLEMENTATION").cloned()
+    };
+    assert_eq!(chosen("rmw_zenoh_cpp"), None, "one may be added to it");
+    assert_eq!(chosen("rmw_cyclonedds_cpp").as_deref(), Some("rmw_cyclonedds_cpp"));
+    root.write_ament("1", "opt/ros/kilted", "rmw_zenoh_cpp", "0.6.4");
+    let refused = root.find(&[], None).expect_err("no node would be reached").to_string();
+    assert!(refused.contains("rmw_zenoh_cpp alone") && refused.contains("add rmw_fastrtps_cpp or"), "{refused}");
+    root.write_ament("2", "opt/ros/kilted", "rmw_fastrtps_cpp", "9.3.3");
+    for given in ["", "rmw_zenoh_cpp", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"] {
+        assert_eq!(chosen(given).as_deref(), Some("rmw_fastrtps_cpp"), "{given}");
+    }
+    root.write_ament("2", "opt/ros/kilted", "rmw_cyclonedds_cpp", "4.0.2");
+    assert_eq!(chosen("rmw_cyclonedds_cpp").as_deref(), Some("rmw_cyclonedds_cpp"));
 }
 
 #[test]

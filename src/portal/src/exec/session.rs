@@ -19,7 +19,7 @@ use tokio_tungstenite::tungstenite::{Bytes, Message};
 
 /// Interval between pings, and number of them without any message of the client after which it is lost.
 const PING: Duration = Duration::from_secs(20);
-const UNANSWERED: u32 = 3;
+const MAX_UNANSWERED_PINGS: u32 = 3;
 /// Time for the rest of the output once the program has ended: a node may have been given the other end and keep it.
 const DRAIN: Duration = Duration::from_secs(10);
 /// Time for the last message to a client that does not read.
@@ -27,7 +27,7 @@ const FAREWELL: Duration = Duration::from_secs(5);
 /// Bytes of output that are read at once.
 const BLOCK: usize = 16 << 10;
 
-/// How a session ended.
+/// End of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ExecOutcome {
     /// The program ended with this exit status.
@@ -195,7 +195,7 @@ async fn send_output<S: AsyncRead + AsyncWrite + Unpin>(
                 let is_alive = liveness.is_heard.swap(false, Ordering::Relaxed)
                     || liveness.is_held.load(Ordering::Relaxed);
                 unanswered = if is_alive { 0 } else { unanswered + 1 };
-                if unanswered > UNANSWERED {
+                if unanswered > MAX_UNANSWERED_PINGS {
                     return ExecOutcome::Left;
                 }
                 sink.send(Message::Ping(Bytes::new())).await

@@ -4,14 +4,14 @@ use api::explain::{Cause, Link, Served, Weight};
 use api::{Event, Phase, count};
 
 /// Thresholds above which a share or difference is reported.
-const THROTTLED: f64 = 0.05;
+const THROTTLED_SHARE: f64 = 0.05;
 const WAITS: f64 = 10.0;
 const CLOCK_APART: f64 = 100.0;
 const LATE: f64 = 0.05;
-const QUEUED: f64 = 0.25;
-/// In milliseconds; less does not count as a queue.
+const QUEUE_SHARE: f64 = 0.25;
+/// Waiting time in milliseconds below which there is no queue.
 const QUEUE: f64 = 5.0;
-const LEFT_OUT: f64 = 0.1;
+const LEFT_OUT_SHARE: f64 = 0.1;
 /// Kind of the event of a stateful hand-over.
 const STATE_LOST: &str = "state-lost";
 
@@ -111,7 +111,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
             "run on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned(),
         );
     }
-    if served.throttled > THROTTLED {
+    if served.throttled > THROTTLED_SHARE {
         let cpus = servant.enforced.and_then(|limits| limits.cpus).or(servant.limits.cpus);
         let limit = cpus.map_or_else(String::new, |cpus| format!(" of {cpus}"));
         say(
@@ -125,7 +125,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         pressure.map(|pressure| [("a core", pressure.cpu), ("memory", pressure.memory), ("a disk", pressure.io)]);
     for (what, share) in waits.into_iter().flatten() {
         // Throttling by the servant's own limit also counts as waiting for a core.
-        let by_itself = what == "a core" && served.throttled > THROTTLED;
+        let by_itself = what == "a core" && served.throttled > THROTTLED_SHARE;
         if share > WAITS && !by_itself {
             say(
                 Weight::Slows,
@@ -260,7 +260,7 @@ fn add_queue_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, S
     };
     let median = |name: &str| link.part(name).map_or(0.0, |part| part.p50);
     let (queue, compute, total) = (median("queue"), median("compute"), median("total"));
-    if queue > QUEUE && queue > QUEUED * total {
+    if queue > QUEUE && queue > QUEUE_SHARE * total {
         say(
             Weight::Slows,
             format!(
@@ -282,7 +282,7 @@ fn add_queue_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, S
                 .to_owned(),
         );
     }
-    if link.left_out as f64 > LEFT_OUT * link.given as f64 {
+    if link.left_out as f64 > LEFT_OUT_SHARE * link.given as f64 {
         say(
             Weight::Slows,
             format!(

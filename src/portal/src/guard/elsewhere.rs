@@ -66,12 +66,12 @@ pub fn check_not_embedded(headers: &HeaderMap) -> Result<(), Error> {
 }
 
 /// Headers added by proxies.
-const FORWARDED: [&str; 6] =
+const PROXY_HEADERS: [&str; 6] =
     ["forwarded", "via", "x-forwarded-for", "x-forwarded-host", "x-forwarded-proto", "x-real-ip"];
 
 /// Refuses requests with a proxy's headers: their clients are on other machines, whatever `Host` says.
 fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
-    match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
+    match PROXY_HEADERS.iter().find(|name| headers.contains_key(**name)) {
         None => Ok(()),
         Some(name) => Err(Error::Foreign {
             what: format!(

@@ -5,7 +5,7 @@ use api::history::{MachineFigures, ServantFigures};
 use api::stream::Machine;
 use api::{Millis, explain};
 
-/// How a figure of several samples is aggregated.
+/// Aggregation of several samples of a figure.
 #[derive(Debug, Clone, Copy)]
 pub enum Aggregation {
     Mean,

@@ -8,9 +8,9 @@ use parking_lot::Mutex;
 use crate::errors::Error;
 
 /// Limit on the connections that look into one servant.
-const MOST: usize = 16;
+const MAX_CONNECTIONS: usize = 16;
 /// Limit on one principal's share of them, so that nobody can lock others out.
-const MOST_EACH: usize = 4;
+const MAX_CONNECTIONS_OF_ONE: usize = 4;
 
 /// Connections that look into servants.
 #[derive(Debug, Default)]
@@ -32,8 +32,12 @@ impl InsideConnections {
         let mut all = self.all.lock();
         let there = all.entry(servant.to_owned()).or_default();
         let own = there.iter().filter(|other| *other == who).count();
-        if there.len() >= MOST || own >= MOST_EACH {
-            return Err(Error::TooManyLook { servant: servant.to_owned(), most: MOST, each: MOST_EACH });
+        if there.len() >= MAX_CONNECTIONS || own >= MAX_CONNECTIONS_OF_ONE {
+            return Err(Error::TooManyLook {
+                servant: servant.to_owned(),
+                most: MAX_CONNECTIONS,
+                each: MAX_CONNECTIONS_OF_ONE,
+            });
         }
         there.push(who.to_owned());
         Ok(InsideSlot { all: Arc::clone(&self.all), servant: servant.to_owned(), who: who.to_owned() })
@@ -58,7 +62,7 @@ impl Drop for InsideSlot {
 /// Permission level inside a servant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InsideRole {
-    /// Everything that the policy grants.
+    /// All operations that the policy grants.
     Acts,
     /// Subscribe only.
     Looks,
@@ -71,12 +75,14 @@ mod tests {
     #[test]
     fn a_servant_is_looked_into_by_so_many_and_nobody_keeps_the_others_out() {
         let lookers = InsideConnections::default();
-        let mut eves: Vec<_> = (0..MOST_EACH).map(|_| lookers.acquire("s1", "eve").expect("room")).collect();
+        let mut eves: Vec<_> =
+            (0..MAX_CONNECTIONS_OF_ONE).map(|_| lookers.acquire("s1", "eve").expect("room")).collect();
         let refused = lookers.acquire("s1", "eve").expect_err("hers are taken");
         assert!(matches!(refused, Error::TooManyLook { .. }), "{refused}");
         let elsewhere = lookers.acquire("s2", "eve").expect("another servant");
-        let others: Vec<_> =
-            (0..MOST - MOST_EACH).map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room")).collect();
+        let others: Vec<_> = (0..MAX_CONNECTIONS - MAX_CONNECTIONS_OF_ONE)
+            .map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room"))
+            .collect();
         lookers.acquire("s1", "late").expect_err("all are taken");
         eves.pop();
         let late = lookers.acquire("s1", "late").expect("room again");

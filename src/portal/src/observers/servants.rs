@@ -15,12 +15,12 @@ use crate::errors::Error;
 /// Minimum interval between two automatic recordings of a servant.
 const PAUSE: Duration = Duration::from_secs(60);
 /// Minimum interval between two requested recordings of a servant.
-const TAKEN: Duration = Duration::from_secs(5);
+const RECORDING_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Black box settings of the configuration.
 #[derive(Debug, Clone)]
 pub struct BlackBoxOptions {
-    /// How far back messages are kept; zero disables black boxes.
+    /// Age up to which messages are kept; zero disables black boxes.
     pub span: Duration,
     /// Memory limit per servant in bytes, including the overhead per message.
     pub memory: usize,
@@ -81,7 +81,7 @@ impl Observers {
         let Some(observed) = observed else {
             return Err(Error::NoBlackBox(servant.to_owned()));
         };
-        match remaining(observed.taken, TAKEN) {
+        match remaining(observed.taken, RECORDING_INTERVAL) {
             Some(left) => Err(Error::RecordedLately { servant: servant.to_owned(), again: left.as_secs() + 1 }),
             None => {
                 observed.taken = Some(Instant::now());
@@ -135,11 +135,11 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn whoever_asks_for_files_again_and_again_waits() {
-        assert_eq!(remaining(None, TAKEN), None);
+        assert_eq!(remaining(None, RECORDING_INTERVAL), None);
         let now = Some(Instant::now());
-        assert_eq!(remaining(now, TAKEN), Some(TAKEN));
-        tokio::time::advance(TAKEN).await;
-        assert_eq!(remaining(now, TAKEN), None);
+        assert_eq!(remaining(now, RECORDING_INTERVAL), Some(RECORDING_INTERVAL));
+        tokio::time::advance(RECORDING_INTERVAL).await;
+        assert_eq!(remaining(now, RECORDING_INTERVAL), None);
         let observers = Observers::default();
         let refused = observers.check_take("s1").expect_err("nothing is kept");
         assert!(matches!(refused, Error::NoBlackBox(_)), "{refused}");

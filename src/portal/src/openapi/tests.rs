@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::{ANY, BASE, MORE, REFUSED, document};
+use super::{ANY, BASE, FURTHER_REFUSALS, REFUSALS, document};
 use crate::route_access::Access;
 use crate::routes::ROUTES;
 
@@ -86,8 +86,8 @@ fn every_operation_says_with_what_it_may_be_refused() {
             assert!(!statuses.contains_key("default"), "{method} {path}");
         }
     }
-    let words: BTreeSet<u16> = REFUSED.iter().map(|(status, _)| *status).collect();
-    for (id, statuses) in MORE {
+    let words: BTreeSet<u16> = REFUSALS.iter().map(|(status, _)| *status).collect();
+    for (id, statuses) in FURTHER_REFUSALS {
         assert!(ids.contains(*id), "there is no {id}");
         for status in *statuses {
             assert!(words.contains(status), "nothing says what {status} is");

@@ -20,7 +20,7 @@ const PLAIN: &str = "cloudroid";
 const SECURE_SIGNING_IN: &str = "__Host-cloudroid-oidc";
 const PLAIN_SIGNING_IN: &str = "cloudroid-oidc";
 /// Time in seconds that this may take.
-const SIGNING_IN: u64 = 600;
+const SIGN_IN_SECONDS: u64 = 600;
 /// Header in which browsers tell how a response will be used (Fetch Metadata, W3C).
 const FETCH_DEST: &str = "sec-fetch-dest";
 /// Header in which browsers tell where a request comes from (Fetch Metadata, W3C).
@@ -83,7 +83,7 @@ pub fn clear_session(secure: bool) -> HeaderValue {
 
 /// Sets the cookie that identifies the browser during a sign-in.
 pub fn set_signing_in(secure: bool, secret: &str) -> HeaderValue {
-    build_cookie(secure, signing_in_cookie_name(secure), secret, SIGNING_IN, "Lax")
+    build_cookie(secure, signing_in_cookie_name(secure), secret, SIGN_IN_SECONDS, "Lax")
 }
 
 /// Returns the token that requests changing something must send along with the session cookie.

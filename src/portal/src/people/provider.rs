@@ -23,7 +23,7 @@ use crate::query::{Query, query_value};
 /// Path to which the provider sends browsers back, below the portal's own origin.
 pub const CALLBACK: &str = "/api/v1/oidc/callback";
 /// Maximum number of groups listed in a refusal.
-const NAMED: usize = 20;
+const MAX_NAMED_GROUPS: usize = 20;
 /// Content-Security-Policy of the pages: no scripts, styles or frames.
 const POLICY: &str = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
@@ -165,8 +165,13 @@ fn no_role_error(known: &IdentityProvider, person: &Person) -> Error {
     let groups: Vec<String> = person.groups.iter().map(|group| plain(group)).collect();
     let has = match groups.len() {
         0 => format!("{} gives none in the claim {}", known.name, known.groups_claim),
-        1..=NAMED => format!("{} says {}", known.name, groups.join(", ")),
-        more => format!("{} lists {} and {} more", known.name, groups[..NAMED].join(", "), more - NAMED),
+        1..=MAX_NAMED_GROUPS => format!("{} says {}", known.name, groups.join(", ")),
+        more => format!(
+            "{} lists {} and {} more",
+            known.name,
+            groups[..MAX_NAMED_GROUPS].join(", "),
+            more - MAX_NAMED_GROUPS
+        ),
     };
     Error::NoRole { who: access::principal::oidc_principal_name(&person.name), has }
 }

@@ -14,7 +14,7 @@ use crate::tokens;
 /// Length of a token in characters out of 36 letters and digits: 268 bits.
 pub(super) const SECRET: usize = 52;
 /// Names of principals that are known without a token.
-pub(super) const RESERVED: [&str; 3] = ["local", "root", "configured"];
+pub(super) const RESERVED_PRINCIPALS: [&str; 3] = ["local", "root", "configured"];
 
 /// Holder of a principal's name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -190,7 +190,7 @@ const MOST_RULES: usize = 1000;
 fn check_token(new: &api::access::NewToken) -> Result<(), Error> {
     let refused = |words: String| Err(Error::BadRequest(words));
     access::principal::check_name(&new.name).map_err(|error| Error::BadRequest(error.to_string()))?;
-    if RESERVED.contains(&new.name.as_str()) {
+    if RESERVED_PRINCIPALS.contains(&new.name.as_str()) {
         return refused(format!("{} is a reserved name; choose another", new.name));
     }
     let (role, scoped) = (new.role, new.role.is_scoped());

@@ -13,12 +13,12 @@ use authority::{Authority, CertificateRequest, IssuedRobotCertificate, VerifiedC
 use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
-use super::changing::{NameHolder, RESERVED};
+use super::changing::{NameHolder, RESERVED_PRINCIPALS};
 use super::identity::{CallerIdentity, Credential};
 use super::recognising::Recogniser;
 use super::refusals::{AuthenticationError, CertificateRefusal, PairingCodeRefusal};
 use super::stored::{StoredPrincipals, StoredScope, record_error};
-use super::{Principals, USED};
+use super::{Principals, USE_INTERVAL};
 use crate::errors::Error;
 use crate::tokens;
 
@@ -27,7 +27,7 @@ const CODE: u64 = 15 * 60;
 const LONGEST_CODE: u64 = 7 * 86_400;
 
 /// Number of times per certificate lifetime that the end of a robot's newest certificate is written.
-const OFTEN: Millis = 10;
+const WRITES_PER_LIFETIME: Millis = 10;
 
 /// A pairing of the database, in memory.
 pub(super) struct StoredPairing {
@@ -188,7 +188,7 @@ impl Principals {
         let stored = self.stored.read();
         let due = stored.find_pairing(id).is_some_and(|paired| {
             let last = paired.last_used.load(Ordering::Relaxed);
-            now.saturating_sub(last) >= USED
+            now.saturating_sub(last) >= USE_INTERVAL
                 && paired.last_used.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);
@@ -301,7 +301,7 @@ impl Principals {
     ) -> Result<IssuedRobotCertificate, Error> {
         let issued = authority.issue(request, robot, store::now(), lifetime).map_err(Error::Uncertifiable)?;
         // Frequent renewals do not each cause a write.
-        let lately = issued.expires.saturating_sub(lifetime.as_millis() as Millis / OFTEN);
+        let lately = issued.expires.saturating_sub(lifetime.as_millis() as Millis / WRITES_PER_LIFETIME);
         let known = {
             let stored = self.stored.read();
             let live = stored.find_pairing(pairing).filter(|paired| !paired.revoked);
@@ -339,7 +339,7 @@ impl Principals {
 fn check_pairing(new: &NewPairing) -> Result<(), Error> {
     let refused = |words: String| Err(Error::BadRequest(words));
     names::validate_robot(&new.robot).map_err(|error| Error::BadRequest(error.to_string()))?;
-    if RESERVED.contains(&new.robot.as_str()) {
+    if RESERVED_PRINCIPALS.contains(&new.robot.as_str()) {
         return refused(format!("{} is a reserved name; choose another", new.robot));
     }
     if new.services.is_empty() {

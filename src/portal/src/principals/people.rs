@@ -9,7 +9,7 @@ use catalogue::names;
 use store::{AccountEdit, NewSession};
 
 use super::Principals;
-use super::changing::{NameHolder, RESERVED, SECRET};
+use super::changing::{NameHolder, RESERVED_PRINCIPALS, SECRET};
 use super::identity::CallerIdentity;
 use super::stored::{KnownAccount, KnownSession, StoredScope, milliseconds, record_error};
 use crate::errors::Error;
@@ -188,7 +188,7 @@ impl Principals {
     /// Checks a new account.
     pub fn check_account(&self, new: &NewAccount) -> Result<(), Error> {
         access::principal::check_name(&new.name).map_err(|error| Error::BadRequest(error.to_string()))?;
-        if RESERVED.contains(&&*new.name) {
+        if RESERVED_PRINCIPALS.contains(&&*new.name) {
             return Err(Error::BadRequest(format!("{} is a reserved name; choose another", new.name)));
         }
         check_role(new.role, &new.services)?;

@@ -36,7 +36,7 @@ pub enum AuthMessageError {
     /// The message was looked at and refused.
     #[error(transparent)]
     Refused(#[from] AuthRefusal),
-    /// Its token was refused, or not looked at.
+    /// The token was refused, or not checked.
     #[error(transparent)]
     Token(#[from] AuthenticationError),
 }

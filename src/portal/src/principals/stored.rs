@@ -167,7 +167,7 @@ pub struct StoredPrincipals {
     /// Indices into `tokens`.
     by_hash: HashMap<TokenHash, usize>,
     pub(super) accounts: Vec<KnownAccount>,
-    /// By the hash of the browser's secret.
+    /// Sessions by the hash of the browser's secret.
     pub(super) sessions: HashMap<TokenHash, KnownSession>,
     /// True if an identity provider is or was configured.
     pub(super) names_provider: bool,

@@ -4,7 +4,7 @@
 use ::access::{AccessAction, AccessObject, Principal, Role, Scope, decide};
 
 use super::{Access, AccessTarget, ROUTES, Route};
-use crate::allowed::check_robot;
+use crate::authorisation::check_robot;
 
 /// Principals of the columns, each for the service `mine`; a robot is `me`.
 fn columns() -> Vec<(&'static str, Principal)> {

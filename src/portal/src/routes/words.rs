@@ -5,7 +5,7 @@ use axum::http::Method;
 use crate::route_access::matches_path;
 
 /// Routes that change something, by method and path. A test compares them with the route table.
-const WORDS: &[(&str, &str, &str)] = &[
+const ROUTE_WORDS: &[(&str, &str, &str)] = &[
     ("DELETE", "/api/v1/services/{name}", "remove"),
     ("POST", "/api/v1/services/{name}/rollback", "roll back"),
     ("POST", "/api/v1/services/{name}/rollout", "order a rollout"),
@@ -46,7 +46,7 @@ const WORDS: &[(&str, &str, &str)] = &[
 
 /// Describes a request: what it does or, if it only reads, what it reads.
 pub fn describe_request(method: &Method, path: &str) -> String {
-    let row = WORDS.iter().find(|(of, pattern, _)| method.as_str() == *of && matches_path(pattern, path));
+    let row = ROUTE_WORDS.iter().find(|(of, pattern, _)| method.as_str() == *of && matches_path(pattern, path));
     match row {
         Some((_, _, words)) => (*words).to_owned(),
         None if *method == Method::GET || *method == Method::HEAD => format!("read {path}"),
@@ -78,11 +78,11 @@ mod tests {
         let changes = changes.map(|route| format!("{} {}", route.method, route.path));
         let changes: BTreeSet<String> =
             changes.chain(recorded_by_their_handlers.into_iter().map(str::to_owned)).collect();
-        let told: BTreeSet<String> = WORDS.iter().map(|(method, path, _)| format!("{method} {path}")).collect();
+        let told: BTreeSet<String> = ROUTE_WORDS.iter().map(|(method, path, _)| format!("{method} {path}")).collect();
         assert_eq!(told, changes);
-        let words: BTreeSet<&str> = WORDS.iter().map(|(_, _, words)| *words).collect();
-        assert_eq!(words.len(), WORDS.len(), "two have the same words");
-        for (method, path, _) in WORDS {
+        let words: BTreeSet<&str> = ROUTE_WORDS.iter().map(|(_, _, words)| *words).collect();
+        assert_eq!(words.len(), ROUTE_WORDS.len(), "two have the same words");
+        for (method, path, _) in ROUTE_WORDS {
             assert!(ROUTES.iter().any(|route| (route.method, route.path) == (*method, *path)), "{method} {path}");
         }
     }

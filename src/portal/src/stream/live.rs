@@ -13,7 +13,7 @@ use crate::errors::Error;
 use crate::slots::{Slot, Slots};
 
 /// Limit on the streams of one principal from one client: open pages, and followed logs and events.
-const MOST: usize = 32;
+const MAX_STREAMS: usize = 32;
 
 /// State at one moment. What has not changed since the previous sample is the same allocation.
 #[derive(Default)]
@@ -57,7 +57,7 @@ impl LiveSamples {
     /// Acquires a slot for a stream of the caller.
     pub fn acquire_slot(&self, caller: &Caller) -> Result<Slot<String>, Error> {
         let who = format!("{} {}", caller.who.principal, caller.peer.budget_name(None));
-        self.streams.acquire(who, MOST).ok_or(Error::TooManyStreams { most: MOST })
+        self.streams.acquire(who, MAX_STREAMS).ok_or(Error::TooManyStreams { most: MAX_STREAMS })
     }
 }
 

@@ -62,7 +62,7 @@ fn a_limited_thread_has_what_is_kept_and_cannot_get_the_rest_back() {
     on_a_thread(|| {
         limit_capabilities().expect("limited");
         let held = caps::read(None, CapSet::Permitted).expect("read");
-        let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
+        let kept: CapsHashSet = KEPT_CAPABILITIES.into_iter().chain([KEPT_IF_THERE]).collect();
         assert!(held.is_subset(&kept), "{held:?}");
         assert!(held.contains(&Capability::CAP_SYS_ADMIN), "run as root");
         let bounding = caps::read(None, CapSet::Bounding).expect("read");
@@ -94,6 +94,6 @@ fn the_unit_allows_what_is_kept_and_no_more() {
         .flat_map(str::split_whitespace)
         .map(|name| name.parse().expect(name))
         .collect();
-    let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
+    let kept: CapsHashSet = KEPT_CAPABILITIES.into_iter().chain([KEPT_IF_THERE]).collect();
     assert_eq!(named, kept);
 }

@@ -57,8 +57,11 @@ impl<P: Clone> Governor<P> {
             return;
         };
         if let Kind::Input(pair) = record.kind {
-            let queue = &mut self.pairs[pair].queues[side.index()];
-            queue.add(id);
+            let stream = &mut self.pairs[pair];
+            stream.queues[side.index()].add(id);
+            if side == Responder::Local {
+                stream.arrivals.note_given_locally(record.asked_at);
+            }
         }
         let channel = record.channel.clone();
         self.give(side, Some(id), channel, payload);
@@ -71,6 +74,9 @@ impl<P: Clone> Governor<P> {
             return;
         };
         record.mark_left_out(side);
+        if let (Kind::Input(pair), Responder::Local) = (record.kind, side) {
+            self.pairs[pair].arrivals.note_given_locally(record.asked_at);
+        }
         if let Some(payload) = record.payload.clone() {
             let channel = record.channel.clone();
             self.give(side, None, channel, payload);

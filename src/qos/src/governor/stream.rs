@@ -3,9 +3,10 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::Governor;
+use super::arrivals::{AnsweredInputs, InputSequence};
 use super::queue::OutstandingInputs;
-use crate::arbiter::{Kind, Record};
+use super::{Governor, OutputAge};
+use crate::arbiter::{DeliveryVerdict, Kind, Record};
 use crate::pair::{Correlation, TopicPair};
 use crate::request::{CorrelationKey, RequestId, Responder, Stamp};
 
@@ -23,6 +24,8 @@ pub(super) struct PairState {
     pub(super) first: Option<Stamp>,
     /// Number of stamped outputs in a row without a matching input; `None` once one has matched.
     pub(super) unmatched: Option<u32>,
+    /// Inputs without a key.
+    pub(super) arrivals: InputSequence,
 }
 
 impl PairState {
@@ -35,6 +38,7 @@ impl PairState {
             passed: None,
             first: None,
             unmatched: Some(0),
+            arrivals: InputSequence::default(),
         }
     }
 
@@ -83,6 +87,45 @@ impl<P: Clone> Governor<P> {
             left_out |= earlier.is_some_and(|record| record.mark_left_out(side));
         }
         queue.note_left_out(left_out);
+    }
+
+    /// Returns the pair of an output that is matched by arrival, and the inputs that it may answer.
+    pub(super) fn find_arrived(
+        &mut self,
+        now: Instant,
+        side: Responder,
+        topic: &str,
+        age: OutputAge,
+    ) -> Option<(usize, AnsweredInputs)> {
+        let is_answer = |stream: &PairState| {
+            let is_first = stream.pair.outputs.first().is_some_and(|output| output == topic);
+            is_first && stream.by == Correlation::Arrival
+        };
+        let pair = self.pairs.iter().position(is_answer)?;
+        Some((pair, self.pairs[pair].arrivals.answered_inputs(now, side, age)?))
+    }
+
+    /// Handles an answer to an input that the other side has answered, too, or a later one. It counts for the request
+    /// that it may answer, and is not delivered.
+    pub(super) fn on_repeated_answer(&mut self, now: Instant, side: Responder, topic: &str, newest: u64) {
+        let found = self.find_request(now, side, topic, None);
+        let may_answer = |(id, _): &(RequestId, usize)| {
+            let record = self.arbiter.get(*id);
+            let asked = record.and_then(|record| match record.kind {
+                Kind::Input(pair) => Some(self.pairs[pair].arrivals.number_at(record.asked_at)),
+                _ => None,
+            });
+            asked.is_some_and(|asked| asked <= newest)
+        };
+        let verdict = found.filter(may_answer).map(|(id, output)| self.on_answer(now, side, id, output));
+        if verdict == Some(DeliveryVerdict::Deliver) {
+            let counted = match side {
+                Responder::Cloud => &mut self.counts.from_cloud,
+                Responder::Local => &mut self.counts.from_local,
+            };
+            *counted -= 1;
+        }
+        self.counts.duplicates += u64::from(verdict != Some(DeliveryVerdict::Drop));
     }
 
     /// Returns the request that an output answers, and the index of the output within the pair.

@@ -387,7 +387,7 @@ impl Dispatcher {
             queue.retain(|other| *other != ticket);
             if queue.is_empty() {
                 self.waiting.remove(&key);
-                self.turns.forget(key);
+                self.turns.withdraw(key);
             }
         }
     }
@@ -450,7 +450,7 @@ impl Dispatcher {
             };
             if self.waiting.get(&key).is_some_and(VecDeque::is_empty) {
                 self.waiting.remove(&key);
-                turns.forget(key);
+                turns.withdraw(key);
             } else {
                 turns.enqueue(key);
             }

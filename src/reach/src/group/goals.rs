@@ -24,9 +24,9 @@ use super::{DispatchEvent, MemberServant, PendingRequest, ServantGroup, describe
 /// Timeout for connecting to the action server of a servant that has registered its interface.
 const CONNECTS: Duration = Duration::from_secs(10);
 /// Maximum number of pending goals per action and robot; more are rejected.
-const MOST: usize = 256;
+const MAX_GOALS: usize = 256;
 /// Time a node may take to end a goal whose robot is gone. After that its servant gets goals of other robots.
-const GONE: Duration = Duration::from_secs(10);
+const END_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A client of one action for one robot.
 pub(super) struct GroupClient {
@@ -86,7 +86,7 @@ impl ActionClient for GroupClient {
             let mut goals = self.goals.lock();
             let refused = match goals.len() {
                 _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
-                MOST.. => Some(format!("{MOST} goals of this robot have not ended; wait for one of them")),
+                MAX_GOALS.. => Some(format!("{MAX_GOALS} goals of this robot have not ended; wait for one of them")),
                 _ => None,
             };
             if let Some(text) = refused {
@@ -193,7 +193,7 @@ impl GroupGoal {
         let (mut told_to_end, mut waits) = (false, false);
         let given_up = async {
             self.gone.cancelled().await;
-            tokio::time::sleep(GONE).await;
+            tokio::time::sleep(END_TIMEOUT).await;
         };
         let mut given_up = std::pin::pin!(given_up);
         loop {
@@ -273,7 +273,8 @@ impl GroupGoal {
                 () = &mut given_up => {
                     let at = at.as_ref().map_or("no servant", |(servant, _)| servant.id.as_str());
                     let words = format!(
-                        "its robot is gone, and {at} did not end it within {GONE:?}; other robots' goals run there, too"
+                        "its robot is gone, and {at} did not end it within {END_TIMEOUT:?}; other robots' goals \
+                         run there, too"
                     );
                     tracing::warn!("goal {} of {}: {words}", self.id, self.name);
                     return Err(GoalError::GivenUp(FailureReason::new(words)));

@@ -186,9 +186,9 @@ impl NodeController for SharedNodes {
 
     async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), NodeError> {
         let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
-        self.told.observer().check_stub(node.revision, &node.image)?;
+        self.told.observer().check_stub(node.revision, &node.image).await?;
         let view = self.node_view(node)?;
-        tenant.take_over();
+        tenant.take_over().await;
         let linked = SharedStubNode { view, exit: watch::Sender::new(None) };
         let mut all = self.linked.lock();
         all.insert(node.name.clone(), linked);

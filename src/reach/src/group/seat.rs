@@ -24,7 +24,7 @@ pub fn open_seat(
     let registry = Arc::clone(&recorded.registry);
     let (notices, noticed) = mpsc::unbounded_channel();
     let (bus, linked) = group.create_buses(&registry, &options.budget, &notices);
-    let nodes = SharedNodes::new(Arc::clone(&linked), recorded, place, observer);
+    let nodes = SharedNodes::new(Arc::clone(&linked), recorded, place, Arc::clone(&observer));
     let shown: Arc<dyn Bus> = bus.clone();
     let behind = InProcessParts {
         id: place.to_owned(),
@@ -36,6 +36,7 @@ pub fn open_seat(
             async move { Ok(JoinedBus { bus, endings }) }.boxed()
         }),
         registry,
+        observer,
         // Lifecycles and components are managed by the servants.
         lifecycles: None,
         components: None,

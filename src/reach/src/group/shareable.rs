@@ -26,7 +26,7 @@ use ros::bus::RosVersion;
 use ros::schema::{Base, MessageType, Registry};
 
 /// Types of topics that no robot needs.
-const UNNEEDED: [&str; 10] = [
+const INTERNAL_TYPES: [&str; 10] = [
     "rosgraph_msgs/Log",
     "rosgraph_msgs/TopicStatistics",
     "rcl_interfaces/Log",
@@ -85,7 +85,7 @@ impl std::error::Error for Unshareable {}
 pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> {
     let mut found = Vec::new();
     let topics = interface.topics.iter();
-    for topic in topics.filter(|topic| !UNNEEDED.contains(&&*plain_type_name(&topic.type_name))) {
+    for topic in topics.filter(|topic| !INTERNAL_TYPES.contains(&&*plain_type_name(&topic.type_name))) {
         let transforms = TRANSFORMS.contains(&&*plain_type_name(&topic.type_name));
         let (verb, of) = match topic.direction {
             Direction::Input if transforms => {

@@ -48,7 +48,7 @@ pub(super) struct NodeAlias<'a> {
 
 impl GroupView {
     /// Creates the view of a complete interface as it was deployed.
-    pub(super) fn deployed(version: RosVersion, interface: &Interface) -> GroupView {
+    pub(super) fn from_interface(version: RosVersion, interface: &Interface) -> GroupView {
         let named = |node: &str| match node {
             "" => SOMEBODY.to_owned(),
             node => node.to_owned(),

@@ -1,4 +1,5 @@
 use async_trait::async_trait;
+use budget::WorkLimit;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{FailureReason, Publisher, QosProfile, ServiceHandler, ServiceType, WireFormat, WireType};
@@ -10,7 +11,9 @@ use crate::doubles::{RecordedEvents, StubNodesDouble};
 use crate::memory_bus::{MemoryBus, MemorySystem};
 
 /// Only limits the duration of a failing test.
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
+/// More than these tests take.
+const WORK: WorkLimit = WorkLimit { cores: 1.0, burst: PATIENCE };
 const NODE: &str = "/sentry";
 /// State ids (`lifecycle_msgs/msg/State`).
 const UNCONFIGURED: u8 = 1;
@@ -22,6 +25,7 @@ struct LifecycleWorld {
     system: Arc<MemorySystem>,
     events: Arc<RecordedEvents>,
     lifecycles: LifecycleDriver,
+    budget: Budget,
 }
 
 impl LifecycleWorld {
@@ -29,13 +33,14 @@ impl LifecycleWorld {
         let (system, events) = (Arc::<MemorySystem>::default(), Arc::<RecordedEvents>::default());
         let bus: Arc<dyn Bus> = system.join("/cloudroid_bridge");
         let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) = (Arc::new(started), events.clone());
-        let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer);
-        Self { system, events, lifecycles: lifecycles.expect("ROS 2") }
+        let budget = Budget::new("the daemon", 1 << 20).child_with_work("servant x", 1 << 20, WORK);
+        let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer, &budget);
+        Self { system, events, lifecycles: lifecycles.expect("ROS 2"), budget }
     }
 
     async fn wait_stages(&self, wanted: impl Fn(&Stages) -> bool) -> Stages {
         let mut stages = self.lifecycles.stages();
-        let found = timeout(LONG, stages.wait_for(wanted)).await;
+        let found = timeout(PATIENCE, stages.wait_for(wanted)).await;
         found.expect("in time").expect("followed").clone()
     }
 
@@ -175,7 +180,7 @@ async fn a_node_begins_as_it_appears_and_its_states_are_told() {
     // The follower starts watching a moment after the activation.
     let watched = |matched: &ros::bus::MatchedPeers| matched.connected_count() == 1;
     let mut watchers = node.changes.matched_subscribers();
-    let waited = timeout(LONG, watchers.wait_for(watched)).await;
+    let waited = timeout(PATIENCE, watchers.wait_for(watched)).await;
     waited.expect("in time").expect("advertised");
     node.transition(ACTIVE, INACTIVE);
     assert_eq!(world.wait_stage("inactive").await, settled_stage("inactive"));
@@ -186,6 +191,14 @@ async fn a_node_begins_as_it_appears_and_its_states_are_told() {
     let again = Staged::start(&world, false, 2).await;
     assert_eq!(world.wait_stage("active").await, settled_stage("active"));
     assert_eq!(again.requested_transitions(), ["configure", "activate"]);
+}
+
+#[tokio::test]
+async fn following_nodes_is_charged_to_their_servant() {
+    let world = LifecycleWorld::new(StubNodesDouble::default());
+    let _node = Staged::start(&world, false, 2).await;
+    world.wait_stage("active").await;
+    assert!(world.budget.work_time() > Duration::ZERO);
 }
 
 #[tokio::test]

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use parking_lot::Mutex;
 
 /// Number of runs remembered; the least recently seen ones are forgotten.
-const REMEMBERED: usize = 256;
+const MAX_RUNS: usize = 256;
 
 /// The last attempt of each run.
 #[derive(Debug, Default)]
@@ -21,7 +21,7 @@ impl Attempts {
         let known = last.iter().position(|(known, _)| known == run);
         let known = known.and_then(|at| last.remove(at));
         let newest = known.map_or(0, |(_, newest)| newest);
-        if last.len() == REMEMBERED {
+        if last.len() == MAX_RUNS {
             last.pop_front();
         }
         last.push_back((run.to_owned(), newest.max(attempt)));
@@ -55,11 +55,11 @@ mod tests {
     #[test]
     fn few_are_remembered() {
         let attempts = Attempts::default();
-        for number in 0..REMEMBERED * 2 {
+        for number in 0..MAX_RUNS * 2 {
             assert!(attempts.is_newest("mine", 2));
             assert!(attempts.is_newest(&number.to_string(), 1));
         }
-        assert_eq!(attempts.last.lock().len(), REMEMBERED);
+        assert_eq!(attempts.last.lock().len(), MAX_RUNS);
         assert!(!attempts.is_newest("mine", 1), "it was heard of again and again");
     }
 }

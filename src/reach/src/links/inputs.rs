@@ -13,7 +13,7 @@ use ros::schema::{MessageType, SchemaError};
 use ros::sizes::SizeCounters;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use super::given::{Mark, stamp_mark};
+use super::given_inputs::{Mark, stamp_mark};
 use super::state::{Hub, NodeLink, ServantView};
 use link::clock::now;
 use link::control::InputChannel;
@@ -25,7 +25,7 @@ use ros::codec::Stamps;
 /// Queue length for a slow node.
 const QUEUE: usize = 256;
 /// History depth for a transient-local publisher of ROS 2 if the robot does not announce one; the default of ROS 2.
-const KEPT: usize = 10;
+const DEFAULT_DEPTH: usize = 10;
 /// Limit on what waits until the topic is advertised and the node connected.
 const WAITING: RingBounds = RingBounds { messages: 256, bytes: 32 << 20 };
 
@@ -48,7 +48,7 @@ struct InputChannelState {
 }
 
 enum State {
-    /// Not yet advertised, or the node has not connected.
+    /// The topic is not yet advertised, or the node has not connected.
     Waiting(Ring<Bytes>),
     Open(Arc<dyn Publisher>),
 }
@@ -218,7 +218,7 @@ fn offered_qos(input: &InputChannel, version: RosVersion, graph: &Graph) -> QosP
         return QosProfile::keep_last(QUEUE).latching(latching);
     }
     let told = input.qos.as_ref().map(|qos| qos.to_bus(1));
-    let kept = told.map_or(KEPT, |told| told.depth);
+    let kept = told.map_or(DEFAULT_DEPTH, |told| told.depth);
     let latching = latching || told.is_some_and(|told| told.is_latching());
     let mut offer = QosProfile {
         lifespan: told.and_then(|told| told.lifespan),
@@ -285,7 +285,7 @@ mod tests {
     fn old_maps_are_not_given_to_newcomers_for_ever() {
         let graph = Graph::default();
         let of = |latching, version| offered_qos(&input(latching, None), version, &graph);
-        assert_eq!(of(true, RosVersion::Two), QosProfile::keep_last(KEPT).latching(true));
+        assert_eq!(of(true, RosVersion::Two), QosProfile::keep_last(DEFAULT_DEPTH).latching(true));
         assert_eq!(of(false, RosVersion::Two), QosProfile::keep_last(QUEUE));
         // Subscribers of ROS 1 receive the last one, regardless of the queue length.
         assert_eq!(of(true, RosVersion::One), QosProfile::keep_last(QUEUE).latching(true));

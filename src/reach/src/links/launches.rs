@@ -8,7 +8,7 @@ use ros::bus::{BusError, ParamValue, ParameterKind, RosVersion};
 use ros::ros2::arguments::BEGIN;
 use ros::spelling::RespelledArguments;
 
-use super::node_time::SIMULATED;
+use super::node_time::SIM_TIME;
 use super::parameters::translate_value;
 use super::state::{Hub, ServantView};
 
@@ -56,8 +56,8 @@ impl Hub {
         let Ok(parameters) = self.bus.parameters() else {
             return Ok(());
         };
-        let key = format!("/{SIMULATED}");
-        let wanted = is_simulated(hello.parameters.get(SIMULATED));
+        let key = format!("/{SIM_TIME}");
+        let wanted = is_simulated(hello.parameters.get(SIM_TIME));
         let there = is_simulated(parameters.get(&key).await.ok().as_ref());
         if wanted != there {
             parameters.set(&key, ParamValue::Bool(wanted)).await?;
@@ -69,7 +69,7 @@ impl Hub {
     /// ROS its parameters are passed on as the servant's ROS has them.
     pub(super) async fn prepare_launch(&self, view: &ServantView, node: &NodeLaunch) -> (NodeLaunch, Option<String>) {
         let mut launch = node.clone();
-        let Some(bus) = view.translated() else {
+        let Some(bus) = view.translated_bus() else {
             return (launch, None);
         };
         let kinds = self.nodes.interface().map(parameter_kinds).unwrap_or_default();

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use ros::bus::{Digest, RosVersion, ServiceType, TypeInquiries, WireType};
 use translation::bus::LeftOut;
 
-use super::seen::{self, DeclaredType, NodeEndpointSet};
+use super::node_endpoints::{self, DeclaredType, NodeEndpointSet};
 use super::state::{Hub, NodeLink, NodeService};
 use super::types;
 use link::control::{FromCloud, Graph, OutputChannel, RequestedInput, ServiceChannel};
 use ros::codec::Stamps;
 
 /// Maximum number of nodes that are warned about.
-const WARNED: usize = 20;
+const MAX_WARNINGS: usize = 20;
 
 /// The state sent to the robot so far.
 #[derive(Default)]
@@ -73,7 +73,7 @@ impl MirrorState {
         self.inquire(link, &seen).await;
         let mut graph = Graph {
             siblings: hub.siblings(&graph, &link.node),
-            nodes: seen::owners(&graph, &link.node),
+            nodes: node_endpoints::owners(&graph, &link.node),
             ..Graph::default()
         };
         for (topic, declared) in &seen.outputs {
@@ -148,7 +148,7 @@ impl MirrorState {
     /// Warns once about each node that is left out.
     fn warn_of_shared(&mut self, link: &NodeLink, shared: BTreeSet<String>) {
         for name in shared {
-            if self.warned.len() < WARNED && !self.warned.contains(&name) {
+            if self.warned.len() < MAX_WARNINGS && !self.warned.contains(&name) {
                 link.session.send_control(&FromCloud::Notice {
                     warning: true,
                     text: format!(
@@ -166,7 +166,7 @@ impl MirrorState {
     fn warn_of_omissions(&mut self, link: &NodeLink, left_out: &LeftOut) {
         let own = left_out.iter().filter(|(_, entry)| entry.nodes.contains(&link.node));
         for (what, entry) in own {
-            if self.omitted.len() < WARNED && self.omitted.insert(what.clone()) {
+            if self.omitted.len() < MAX_WARNINGS && self.omitted.insert(what.clone()) {
                 let text = format!("{what} of {} is not on the robot: {}", link.node, entry.reason);
                 link.session.send_control(&FromCloud::Notice { warning: true, text });
             }

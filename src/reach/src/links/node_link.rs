@@ -7,22 +7,23 @@ use std::time::{Duration, Instant};
 use budget::Permit;
 use parking_lot::Mutex;
 use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::time::timeout;
 use tokio_util::task::AbortOnDropHandle;
 use tracing::Instrument;
 
 use super::inputs::InputChannels;
-use super::lent::RobotServices;
+use super::lent_services::RobotServices;
 use super::node_time;
 use super::outputs::{ChannelListeners, Outputs};
 use super::requests::{MeasuredRequest, RequestLog};
 use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine, ServantView};
 use super::unsent::UnsentCounter;
-use super::{LinkStatus, mirror, seen};
+use super::{LinkStatus, mirror, node_endpoints};
 use crate::FlowCounts;
 use link::clock::ClockSample;
 use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint};
 use link::drops::{Cause, DropCounters, DropReporter, TopicDropCount};
-use link::record::{ReceivedCall, Record};
+use link::record::{Call, Record};
 use link::session::{CloudSession, SessionHandler, SessionOptions};
 use link::skew::Direction;
 use ros::bus::{BusError, FailureReason};
@@ -35,6 +36,9 @@ const OPENING: usize = 64;
 const GOAL: Duration = Duration::from_secs(24 * 3600);
 /// Interval at which drops are checked.
 const DROPS: Duration = Duration::from_secs(2);
+/// Time without a line after which a node that has ended has printed its last one, and time for all of them.
+const LAST_LINE: Duration = Duration::from_millis(100);
+const LAST_LINES: Duration = Duration::from_secs(1);
 
 impl NodeLink {
     pub(super) fn start(
@@ -42,7 +46,7 @@ impl NodeLink {
         hello: &Hello,
         view: Arc<ServantView>,
         options: SessionOptions,
-        mut lines: mpsc::Receiver<(bool, String)>,
+        lines: mpsc::Receiver<(bool, String)>,
     ) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
         let (signals, sent) = mpsc::unbounded_channel();
@@ -78,19 +82,11 @@ impl NodeLink {
         });
         link.spawn(process_orders(Arc::clone(&link), Arc::clone(hub), taken));
         link.spawn(forward_signals(Arc::clone(&link), Arc::clone(hub), sent));
-        link.spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub)));
-        link.spawn(node_time::follow(Arc::clone(&link), Arc::clone(hub)));
-        let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
-        link.spawn(async move {
-            let exit = nodes.wait_exit(&watching.node).await;
-            watching.session.send_control(&FromCloud::Exited(exit));
-        });
-        let printing = Arc::clone(&link);
-        link.spawn(async move {
-            while let Some((error, text)) = lines.recv().await {
-                printing.session.send_control(&FromCloud::Line { error, text });
-            }
-        });
+        // The nodes change the graph as often as they like.
+        let budget = &hub.options.budget;
+        link.spawn(budget.meter(mirror::follow(Arc::clone(&link), Arc::clone(hub))));
+        link.spawn(budget.meter(node_time::follow(Arc::clone(&link), Arc::clone(hub))));
+        link.spawn(forward_lines(Arc::clone(&link), Arc::clone(hub), lines));
         link.spawn(report_drops(Arc::clone(&link)));
         link
     }
@@ -175,7 +171,7 @@ impl NodeLink {
     fn local_drops(&self) -> Vec<TopicDropCount> {
         let mut all = self.session.drops();
         all.extend(self.drops.snapshot());
-        let losses = self.view.translated().map(TranslatedBus::losses).unwrap_or_default();
+        let losses = self.view.translated_bus().map(TranslatedBus::losses).unwrap_or_default();
         let lost = losses.into_iter().filter(|loss| loss.untranslated > 0 && self.has(&loss.name));
         all.extend(lost.map(|loss| TopicDropCount {
             topic: loss.name,
@@ -188,7 +184,7 @@ impl NodeLink {
     fn missing_services(&self) -> Vec<String> {
         let graph = self.view.bus.graph();
         let graph = graph.borrow();
-        let mut sought = seen::unmet_lookups(&graph, &self.node);
+        let mut sought = node_endpoints::unmet_lookups(&graph, &self.node);
         sought.retain(|service| !self.lent.has(service));
         sought
     }
@@ -206,9 +202,9 @@ impl NodeLink {
         listening.iter().filter(|topic| !fed(topic)).cloned().collect()
     }
 
-    /// Calls a service of the node. The request is charged to the robot until it is answered.
-    fn call(self: &Arc<Self>, call: ReceivedCall) {
-        let ReceivedCall { id, service, request, held, taken } = call;
+    /// Calls a service of the node, for a call received at `taken`. It is charged to the robot until it is answered.
+    fn call(self: &Arc<Self>, call: Call, held: Permit, taken: i64) {
+        let Call { id, service, request } = call;
         let known = self.services.lock().get(&service).cloned();
         let (Some(service), Some(hub)) = (known, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
@@ -272,7 +268,7 @@ impl NodeLink {
                 let _ = self.signals.send(signal);
             }
             // A channel is closed after the messages before it.
-            Record::Data(_) | Record::Call { .. } | Record::Control(FromRobot::Close { .. }) => {
+            Record::Data(_) | Record::Call(_) | Record::Control(FromRobot::Close { .. }) => {
                 let at = arrived;
                 match self.held.try_hold(HeldRecord { record, held, at }) {
                     Some(arrival) => this.deliver_to_node(arrival),
@@ -317,7 +313,7 @@ impl NodeLink {
                     self.outputs.record_input(channel, mark, answered);
                 }
             }
-            Record::Call { id, service, request } => self.call(ReceivedCall { id, service, request, held, taken: at }),
+            Record::Call(call) => self.call(call, held, at),
             Record::Control(told) => {
                 let _ = self.orders.send(QueuedOrder { told, hold: None, _held: held });
             }
@@ -388,12 +384,32 @@ async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::Un
             }
             FromRobot::Dropped(dropped) => *link.dropped.lock() = dropped,
             FromRobot::Refused(mut refused) => {
-                refused.truncate(IncompatibleEndpoint::MOST);
+                refused.truncate(IncompatibleEndpoint::MAX_ENDPOINTS);
                 *link.refused.lock() = refused;
             }
             other => tracing::debug!(?other, "not for the cloud"),
         }
     }
+}
+
+/// Forwards what the node prints, and then its exit status.
+async fn forward_lines(link: Arc<NodeLink>, hub: Arc<Hub>, mut lines: mpsc::Receiver<(bool, String)>) {
+    let send = |(error, text)| link.session.send_control(&FromCloud::Line { error, text });
+    let mut ended = hub.nodes.wait_exit(&link.node);
+    let exit = loop {
+        tokio::select! {
+            exit = &mut ended => break exit,
+            Some(line) = lines.recv() => send(line),
+        }
+    };
+    // Its last lines are on their way through its log. Processes that it has started may print on.
+    let last = async {
+        while let Ok(Some(line)) = timeout(LAST_LINE, lines.recv()).await {
+            send(line);
+        }
+    };
+    let _ = timeout(LAST_LINES, last).await;
+    link.session.send_last(&FromCloud::Exited(exit));
 }
 
 /// Forwards signals from the robot to the node in order.

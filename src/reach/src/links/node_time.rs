@@ -15,14 +15,14 @@ use link::control::Hello;
 use link::skew::{Direction, Skew};
 
 /// Parameter that enables simulated time.
-pub(super) const SIMULATED: &str = "use_sim_time";
+pub(super) const SIM_TIME: &str = "use_sim_time";
 /// Pause before a node that did not answer is asked again.
 const AGAIN: Duration = Duration::from_secs(1);
 
 impl NodeTime {
     /// Returns the time source announced in the robot's hello. In ROS 2 this is the only parameter that it contains.
     pub(super) fn from_hello(hello: &Hello) -> Self {
-        let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
+        let simulated = hello.parameters.get(SIM_TIME) == Some(&ParamValue::Bool(true));
         Self { kept: hello.keep_stamps, simulated: AtomicBool::new(simulated) }
     }
 
@@ -102,14 +102,14 @@ fn node_to_ask(graph: &Graph, node: &str) -> Option<String> {
 /// Follows one run of the node, or until the bus is closed.
 async fn follow_life(link: &NodeLink, node: &str, parameters: &dyn NodeParameters) -> Result<(), BusError> {
     let mut events = parameters.watch(Some(node)).await?;
-    let asked = [SIMULATED.to_owned()];
+    let asked = [SIM_TIME.to_owned()];
     let held = parameters.get(node, &asked).await?;
     if let Some(Some(ParamValue::Bool(simulated))) = held.first() {
         link.time.set_simulated(*simulated);
     }
     while let Some(event) = events.next().await {
         for (name, value) in event.new.iter().chain(&event.changed) {
-            if name == SIMULATED {
+            if name == SIM_TIME {
                 link.time.set_simulated(*value == ParamValue::Bool(true));
             }
         }

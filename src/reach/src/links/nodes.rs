@@ -5,20 +5,11 @@ use std::sync::Weak;
 use async_trait::async_trait;
 use link::control::{Decision, Exit, Hello, NodeLaunch};
 use package::interface::Interface;
-use ros::bus::{FailureReason, ParamValue};
+use ros::bus::{BusError, FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
 use super::requests::MeasuredRequest;
 use crate::observer::Tenant;
-
-/// A node started by a stub.
-#[derive(Debug, Clone)]
-pub struct StubNode {
-    /// Description given by the stub.
-    pub node: NodeLaunch,
-    /// Parameters given by its push.
-    pub given: Vec<(String, ParamValue)>,
-}
 
 /// Error of starting or signalling a node of a servant.
 #[derive(Debug, thiserror::Error)]
@@ -68,12 +59,9 @@ pub enum NodeError {
         /// Name of the stub's node.
         node: String,
     },
-    /// The servant is of a kind whose nodes are started only by stubs.
-    #[error("{0} is started only by stubs")]
-    OnlyByStubs(
-        /// Name of the node.
-        String,
-    ),
+    /// The node's parameters cannot be set.
+    #[error(transparent)]
+    Parameters(#[from] BusError),
     /// The engine does not start the program.
     #[error("{node} cannot be started: {source}")]
     Start {
@@ -111,7 +99,7 @@ pub trait NodeController: Send + Sync + 'static {
     /// Returns whether the node is running.
     async fn is_running(&self, node: &str) -> bool;
     /// Returns the running nodes that stubs have started; empty if nodes are not started individually.
-    async fn running_nodes(&self) -> Vec<StubNode> {
+    async fn running_nodes(&self) -> Vec<NodeLaunch> {
         Vec::new()
     }
     /// Returns the parameters that the deployer gave for this executable; they override the robot's.

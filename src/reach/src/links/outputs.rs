@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::Instrument;
 
-use super::given::{GivenInputs, Mark, stamp_mark};
+use super::given_inputs::{GivenInputs, Mark, stamp_mark};
 use super::state::{HoldGuard, Hub, NodeLink};
 use link::DeliveryMode;
 use link::clock::now;
@@ -26,9 +26,9 @@ use ros::codec::Stamps;
 /// Queue length of the bus for a busy link.
 const QUEUE: usize = 256;
 /// Maximum number of publishers of a topic that are remembered.
-const REMEMBERED: usize = 256;
+const MAX_PUBLISHERS: usize = 256;
 /// Time for a publisher to say how many messages it keeps, once the first of them has arrived.
-const KEPT: std::time::Duration = std::time::Duration::from_millis(100);
+const ANNOUNCEMENT_TIMEOUT: std::time::Duration = std::time::Duration::from_millis(100);
 /// First and longest interval at which it is checked whether a node sends a topic to us.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
 const LONGEST_LOOK: std::time::Duration = std::time::Duration::from_millis(50);
@@ -176,7 +176,7 @@ impl Outputs {
                     let is_first = kept.is_none() && message.as_ref().is_some_and(|message| message.latching);
                     if latching && is_first && bus.version() == RosVersion::Two {
                         // The robot keeps as many as the node, from the first message on.
-                        let _ = tokio::time::timeout(KEPT, met.wait_for(say_what_they_keep)).await;
+                        let _ = tokio::time::timeout(ANNOUNCEMENT_TIMEOUT, met.wait_for(say_what_they_keep)).await;
                         met.mark_changed();
                         let told = own.kept_messages(&met.borrow()).or(Some(1));
                         reader.send_kept(channel, told, &mut kept);
@@ -240,7 +240,7 @@ impl OwnPublishers {
         let has = is_of(publisher.node());
         if has {
             // So many publishers are not worth remembering.
-            if self.0.len() >= REMEMBERED {
+            if self.0.len() >= MAX_PUBLISHERS {
                 self.0.clear();
             }
             self.0.insert(publisher.clone());
@@ -358,9 +358,9 @@ mod tests {
             MatchedPeers { peers: vec![there(peer("/tenor", 2)), there(peer("/bass", 2))], ..MatchedPeers::default() };
         own.add_present(&present, is_of);
         assert!(own.is_own(&peer("/tenor", 2), gone) && !own.is_own(&peer("/bass", 2), gone));
-        for number in 0..2 * REMEMBERED as u64 {
+        for number in 0..2 * MAX_PUBLISHERS as u64 {
             own.is_own(&peer("/tenor", number), is_of);
         }
-        assert!(own.0.len() <= REMEMBERED);
+        assert!(own.0.len() <= MAX_PUBLISHERS);
     }
 }

@@ -11,7 +11,7 @@ use ros::ros1::own_parameters::is_set_by_master;
 use tokio::sync::OnceCell;
 use tracing::Instrument;
 
-use super::node_time::SIMULATED;
+use super::node_time::SIM_TIME;
 use super::runs::RUNS;
 use super::state::{Hub, ParameterMirror, PendingChange};
 use link::control::{FromCloud, Hello, NodeLaunch};
@@ -64,7 +64,7 @@ impl ParameterMirror {
     /// Applies changes made on the robot.
     pub(super) async fn apply_changes(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
         for (key, value) in changes {
-            if key.trim_start_matches('/') == SIMULATED {
+            if key.trim_start_matches('/') == SIM_TIME {
                 hub.set_simulated(value == Some(ParamValue::Bool(true)));
             }
             match value {

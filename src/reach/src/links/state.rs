@@ -25,7 +25,7 @@ use translation::TranslationRules;
 
 use super::attempts::Attempts;
 use super::inputs::InputChannels;
-use super::lent::RobotServices;
+use super::lent_services::RobotServices;
 use super::nodes::NodeController;
 use super::outputs::Outputs;
 use super::requests::RequestLog;
@@ -152,10 +152,12 @@ pub(super) struct HoldQueue {
 }
 
 /// The active holds, and what waits for them.
+#[derive(Default)]
 pub(super) struct HoldState {
     /// Active holds by number.
     pub(super) holds: BTreeSet<u64>,
     pub(super) next: u64,
+    /// Nothing is dropped: if there is too much, the oldest are passed on.
     pub(super) records: Ring<HeldRecord>,
     /// A task is draining the queue, so other records queue up behind.
     pub(super) passing: bool,

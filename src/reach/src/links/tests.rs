@@ -15,6 +15,7 @@ use link::record::Record;
 
 mod node_time;
 mod refused;
+mod setup;
 
 /// A servant whose nodes run once started and do nothing.
 #[derive(Default)]
@@ -24,6 +25,8 @@ struct QuietNodes {
     /// Nodes that neither start nor end.
     stuck: Mutex<BTreeSet<String>>,
     signals: watch::Sender<Vec<(String, i32)>>,
+    /// Parameters that the push gave them.
+    given: Mutex<Vec<(String, ParamValue)>>,
 }
 
 impl QuietNodes {
@@ -59,8 +62,12 @@ impl NodeController for QuietNodes {
     async fn is_running(&self, node: &str) -> bool {
         self.running.lock().contains(node)
     }
+    async fn running_nodes(&self) -> Vec<NodeLaunch> {
+        let running = self.running.lock();
+        running.iter().map(|name| NodeLaunch { name: name.clone(), ..NodeLaunch::default() }).collect()
+    }
     fn parameters(&self, _: &NodeLaunch) -> Vec<(String, ParamValue)> {
-        Vec::new()
+        self.given.lock().clone()
     }
     fn translate(&self, _: &NodeLaunch, text: &str) -> String {
         text.to_owned()
@@ -114,7 +121,7 @@ async fn serve_hello(
 ) -> (WebSocket<DuplexStream>, Welcome, JoinHandle<DisconnectReason>) {
     let (robot, cloud) = duplex(1 << 16);
     let hub = Arc::clone(hub);
-    let serving = tokio::spawn(async move { hub.serve(cloud, b"").await });
+    let serving = tokio::spawn(async move { hub.serve_until(cloud, b"", std::future::pending()).await });
     let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
     let mut held = Budget::without_limit().permit();
@@ -181,6 +188,22 @@ async fn parameters_that_are_set_before_there_is_a_link_are_paid_for() {
 }
 
 #[tokio::test]
+async fn following_the_graph_for_a_link_is_charged_to_the_servant() {
+    let work = budget::WorkLimit { cores: 1.0, burst: PATIENCE };
+    let budget = Budget::new("the daemon", 1 << 30).child_with_work("servant s1", 1 << 30, work);
+    let options = HubOptions { budget: budget.clone(), ..HubOptions::default() };
+    let (hub, _nodes) = hub_with(options).await;
+    assert_eq!(budget.work_time(), Duration::ZERO);
+    let _linked = send_hello(&hub, &hello("/detect", 1)).await;
+    let charged = async {
+        while budget.work_time().is_zero() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, charged).await.expect("its graph is followed");
+}
+
+#[tokio::test]
 async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
     let mut long = hello("/detect", 1);
     long.parameters = many_parameters();
@@ -188,12 +211,12 @@ async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
     wordy.host = "x".repeat(MAX_CONTROL);
     for (room, hello, words) in [
         (4 << 20, long, "do not fit into the memory for robot x"),
-        (64 << 20, wordy, "a hello without parameters of 10485"),
+        (64 << 20, wordy, "a hello without parameters of 104"),
     ] {
         let options = HubOptions { budget: Budget::new("robot x", room), ..HubOptions::default() };
         let (hub, nodes) = hub_with(options).await;
         let (robot, cloud) = duplex(1 << 16);
-        tokio::spawn(async move { hub.serve(cloud, b"").await });
+        tokio::spawn(async move { hub.serve_until(cloud, b"", std::future::pending()).await });
         let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
         send_open(&mut socket, &hello).await.unwrap();
         let reason = read_until_close(socket).await;
@@ -286,7 +309,7 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let starting = Hello { run: "another life".into(), ..hello("/starting", 1) };
     let (robot, cloud) = duplex(1 << 16);
     let serving = Arc::clone(&hub);
-    tokio::spawn(async move { serving.serve(cloud, b"").await });
+    tokio::spawn(async move { serving.serve_until(cloud, b"", std::future::pending()).await });
     let mut starting_socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut starting_socket, &starting).await.unwrap();
     // … and another never finishes ending, after its robot has left it.
@@ -414,4 +437,21 @@ fn a_robot_may_tell_any_number_for_its_t_max() {
     for max in [1e300, f64::INFINITY, f64::NAN, -1.0, 0.0, 1e-300] {
         assert_eq!(max_age(max), None, "{max}");
     }
+}
+
+#[tokio::test]
+async fn a_robot_that_may_no_longer_be_served_is_told_why() {
+    let (hub, _nodes) = hub().await;
+    let (robot, cloud) = duplex(1 << 16);
+    let (revoke, revoked) = tokio::sync::oneshot::channel::<String>();
+    let serving = tokio::spawn(async move { hub.serve_until(cloud, b"", async { revoked.await.unwrap() }).await });
+    let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
+    send_open(&mut socket, &hello("/detect", 1)).await.unwrap();
+    let mut held = Budget::without_limit().permit();
+    let welcome = receive_open(&mut socket, "welcome", &mut held).await.unwrap();
+    assert!(matches!(welcome, Welcome::Accepted { .. }), "{welcome:?}");
+    revoke.send("its token was revoked".to_owned()).unwrap();
+    assert_eq!(read_until_close(socket).await, "its token was revoked");
+    let ended = serving.await.unwrap();
+    assert!(matches!(ended, DisconnectReason::Closed { code: 1008, .. }), "{ended:?}");
 }

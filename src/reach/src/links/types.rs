@@ -9,9 +9,9 @@ use translation::bus::TranslatedBus;
 
 /// The definitions of the types on a bus.
 pub(super) enum TypeDefinitions {
-    /// Those of the image.
+    /// Types of the image.
     Image(Arc<Registry>),
-    /// Their twins.
+    /// Twins of the image's types.
     Twins(Arc<TranslatedBus>),
 }
 

@@ -10,6 +10,7 @@ use tokio::sync::watch;
 use translation::TypeTranslations;
 use translation::bus::{LeftOut, TranslatedBus, TranslationObserver};
 
+use super::lent_services::PartLender;
 use super::state::{Hub, ParameterMirror, ServantView};
 use super::types::TypeDefinitions;
 
@@ -27,11 +28,11 @@ impl ServantView {
 
     /// Returns what this view lacks because the robot's ROS cannot express it; `None` for robots of the same ROS.
     pub(super) fn left_out(&self) -> Option<watch::Receiver<Arc<LeftOut>>> {
-        self.translated().map(TranslatedBus::left_out)
+        self.translated_bus().map(TranslatedBus::left_out)
     }
 
     /// Returns the translated bus of robots with the other ROS.
-    pub(super) fn translated(&self) -> Option<&TranslatedBus> {
+    pub(super) fn translated_bus(&self) -> Option<&TranslatedBus> {
         match &self.types {
             TypeDefinitions::Image(_) => None,
             TypeDefinitions::Twins(bus) => Some(bus),
@@ -53,6 +54,9 @@ impl Hub {
             let _span = self.log_span.enter();
             let budget = &self.options.budget;
             let bus = TranslatedBus::new(Arc::clone(&self.bus), types, registry(), observer, budget);
+            if version == RosVersion::Two {
+                bus.lend_actions(Arc::new(PartLender { hub: Arc::downgrade(self), version }));
+            }
             ServantView::new(Arc::clone(&bus) as _, TypeDefinitions::Twins(bus))
         });
         Arc::clone(view)

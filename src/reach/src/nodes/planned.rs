@@ -36,15 +36,15 @@ enum OwnNodesStage {
 pub(super) struct OwnNodes(Mutex<OwnNodesStage>);
 
 impl OwnNodes {
-    /// Waits until none is running. `take_over` is called once to determine whether there are any to end. The future
-    /// may be dropped meanwhile: the next caller continues.
-    pub(super) async fn end_once<F>(&self, take_over: impl FnOnce() -> bool, ending: impl FnOnce() -> F)
+    /// Waits until none is running. `take_over` is awaited by the first caller to determine whether there are any to
+    /// end. The future may be dropped meanwhile: the next caller continues.
+    pub(super) async fn end_once<F>(&self, take_over: impl Future<Output = bool>, ending: impl FnOnce() -> F)
     where
         F: Future<Output = ()>,
     {
         let mut stage = self.0.lock().await;
         if *stage == OwnNodesStage::Running {
-            *stage = if take_over() { OwnNodesStage::Ending } else { OwnNodesStage::Ended };
+            *stage = if take_over.await { OwnNodesStage::Ending } else { OwnNodesStage::Ended };
         }
         if *stage == OwnNodesStage::Ending {
             ending().await;
@@ -89,7 +89,7 @@ mod tests {
             let (planned, asked) = (Arc::clone(&planned), Arc::clone(&asked));
             let (begun, over) = (Arc::clone(&begun), Arc::clone(&over));
             tokio::spawn(async move {
-                let take_over = || asked.fetch_add(1, Ordering::Relaxed) == 0;
+                let take_over = async { asked.fetch_add(1, Ordering::Relaxed) == 0 };
                 let ending = || async {
                     begun.add_permits(1);
                     over.acquire().await.unwrap().forget();
@@ -115,7 +115,7 @@ mod tests {
     async fn where_stubs_were_first_there_is_nothing_to_end() {
         let planned = OwnNodes::default();
         for _ in 0..2 {
-            planned.end_once(|| false, || async { panic!("none was started") }).await;
+            planned.end_once(async { false }, || async { panic!("none was started") }).await;
         }
     }
 }

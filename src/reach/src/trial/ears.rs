@@ -16,7 +16,7 @@ use super::{QUEUE, trial_error};
 use crate::Error;
 
 /// Maximum size of a message that is shown.
-const LONGEST_SHOWN: usize = 2000;
+const MAX_SHOWN_MESSAGE: usize = 2000;
 
 /// All outputs, each received by a task.
 pub(super) struct OutputListeners {
@@ -86,7 +86,7 @@ impl OutputListeners {
         let shown = |topic: &Topic, last: &Bytes| {
             let of_type = registry.message(&topic.type_name).ok()?;
             let mut json = Vec::new();
-            let options = JsonOptions { max_bytes: LONGEST_SHOWN, ..JsonOptions::default() };
+            let options = JsonOptions { max_bytes: MAX_SHOWN_MESSAGE, ..JsonOptions::default() };
             to_json(&of_type, last, &mut json, &options).ok()?;
             serde_json::from_slice(&json).ok()
         };

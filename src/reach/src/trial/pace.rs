@@ -28,9 +28,9 @@ pub struct ReplayPace {
 pub enum RequestGap {
     /// None: each request follows the response before it.
     None,
-    /// As recorded.
+    /// The pace of the recording.
     Recorded,
-    /// At this rate in requests per second.
+    /// A rate in requests per second.
     Rate(f64),
 }
 

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use ros::bus::{Bus, QosProfile, wait_for_connected};
+use ros::bus::Bus;
 use serde_json::json as value;
-use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph};
+use super::lab::{LONG, Lab, Peer, json, set_bool, set_bool_type, wait_graph};
+use super::network::converse;
 use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
@@ -21,19 +21,7 @@ async fn messages_go_there_and_back() {
     let lab = Lab::new();
     let _peer = peer(&lab).await;
     let bus = lab.join(NODE).await;
-    let qos = QosProfile::keep_last(10);
-    let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
-    let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
-    for matched in [ping.matched_subscribers(), pong.matched.clone()] {
-        timeout(LONG, wait_for_connected(matched, 1)).await.expect("somebody");
-    }
-    for number in 0..10 {
-        ping.publish(string_message(&number.to_string()));
-        let message = timeout(LONG, pong.messages.recv()).await;
-        let message = message.expect("a message").expect("the bus is open");
-        let expected = format!(r#"{{"data":"{number}"}}"#);
-        assert_eq!(json(&string(), &message.bytes), expected);
-    }
+    converse(&bus).await;
 }
 
 #[tokio::test]

@@ -110,10 +110,11 @@ class Client(Node):
         say('feedback', list(message.feedback.sequence))
 
     def answered(self, done):
-        self.last = done.result()
-        say('goal', self.last.accepted, bytes(self.last.goal_id.uuid).hex())
-        if self.last.accepted:
-            self.last.get_result_async().add_done_callback(self.ended)
+        # Another thread may hear of another goal meanwhile.
+        goal = self.last = done.result()
+        say('goal', goal.accepted, bytes(goal.goal_id.uuid).hex())
+        if goal.accepted:
+            goal.get_result_async().add_done_callback(self.ended)
 
     def ended(self, done):
         say('ended', done.result().status, list(done.result().result.sequence))

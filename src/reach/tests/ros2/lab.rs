@@ -27,6 +27,18 @@ use tokio::time::timeout;
 /// Only limits the duration of a failing test.
 pub const LONG: Duration = Duration::from_secs(60);
 
+/// Definitions of the service by which a node is asked for its parameters.
+pub const GET_PARAMETERS: [(&str, &str); 2] = [
+    (
+        "rcl_interfaces/msg/ParameterValue",
+        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] \
+         byte_array_value\n\
+         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
+         string_array_value\n",
+    ),
+    ("rcl_interfaces/srv/GetParameters", "string[] names\n---\nParameterValue[] values\n"),
+];
+
 /// Nodes of one servant have their own shared memory.
 const WITHIN: &str = r#"mount -t tmpfs shm /dev/shm && exec "$@""#;
 

@@ -11,7 +11,9 @@ use serde_json::{Value, json as value};
 use tokio::time::timeout;
 
 use super::actions::fibonacci;
-use super::lab::{LONG, Lab, cdr, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph};
+use super::lab::{
+    GET_PARAMETERS, LONG, Lab, cdr, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
+};
 use super::robot::{CloudRequest, LinkedRobot, RunTracker, expect_refusal, find_output, find_service, hello, hub};
 use super::services::{CallerEchoService, request};
 
@@ -20,16 +22,6 @@ const PEER: &str = "/lab/peer";
 const DEFINITIONS: [(&str, &str); 2] = [
     ("std_msgs/msg/String", "string data"),
     ("std_srvs/srv/SetBool", "bool data\n---\nbool success\nstring message\n"),
-];
-const GET_PARAMETERS: [(&str, &str); 2] = [
-    (
-        "rcl_interfaces/msg/ParameterValue",
-        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] \
-         byte_array_value\n\
-         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
-         string_array_value\n",
-    ),
-    ("rcl_interfaces/srv/GetParameters", "string[] names\n---\nParameterValue[] values\n"),
 ];
 
 /// Connects a link of this node, whose robot's end waits until its graph satisfies a condition.
@@ -160,12 +152,12 @@ async fn the_robot_is_told_how_many_messages_a_node_keeps_before_it_gets_them() 
     let (mut robot, graph) = connect_robot(&bus, PEER, both).await;
     for (topic, kept) in [("/plan", &["2", "3", "4"][..]), ("/map", &["kept"])] {
         let output = find_output(&graph, topic).unwrap();
-        assert_eq!(robot.kept(output), None, "{topic}: nobody listens");
+        assert_eq!(robot.kept_count(output), None, "{topic}: nobody listens");
         robot.listen(output);
         for expected in kept {
             let (channel, message) = robot.next_message().await;
             assert_eq!((channel, &*text(&message)), (output.channel, *expected));
-            assert_eq!(robot.kept(output), Some(kept.len()), "{topic}");
+            assert_eq!(robot.kept_count(output), Some(kept.len()), "{topic}");
         }
     }
 }

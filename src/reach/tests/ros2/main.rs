@@ -16,4 +16,5 @@ mod rosbridge;
 mod servers;
 mod services;
 mod succession;
+mod suite;
 mod topics;

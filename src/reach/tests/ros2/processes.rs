@@ -3,28 +3,18 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use link::control::{Graph, InputChannel, NodeEndpoints};
+use link::control::{Graph, InputChannel};
 use ros::bus::{Bus, NodeNames, QosProfile, RosVersion, ServiceType};
 use ros::schema::Registry;
 use serde_json::{Value, json as value};
 
-use super::lab::{Lab, Peer, cdr, json, string, string_message, string_type};
+use super::lab::{GET_PARAMETERS, Lab, Peer, cdr, json, string, string_message, string_type};
 use super::robot::{CloudRequest, LinkedRobot, RunTracker, find_output, find_service, hello, hub};
 
 const NODE: &str = "/cloudroid_bridge";
 /// Arguments as by [`ros::flavour::Flavour::robot_identity`] for the node `/alto`.
 const MARK: [&str; 3] = ["--ros-args", "--enclave", "/cloudroid_link/alto"];
-const DEFINITIONS: [(&str, &str); 3] = [
-    ("std_msgs/msg/String", "string data"),
-    (
-        "rcl_interfaces/msg/ParameterValue",
-        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] \
-         byte_array_value\n\
-         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
-         string_array_value\n",
-    ),
-    ("rcl_interfaces/srv/GetParameters", "string[] names\n---\nParameterValue[] values\n"),
-];
+const DEFINITIONS: [(&str, &str); 3] = [("std_msgs/msg/String", "string data"), GET_PARAMETERS[0], GET_PARAMETERS[1]];
 
 fn names(names: &[&str]) -> BTreeSet<String> {
     names.iter().map(ToString::to_string).collect()
@@ -49,12 +39,12 @@ async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
     let hub = hub(Arc::clone(&bus) as _, Arc::new(RunTracker::default()), &DEFINITIONS);
     let mut robot = LinkedRobot::connect(&hub, &hello("/alto")).await;
     let graph = robot.wait_graph(songs).await;
-    let NodeEndpoints { outputs, inputs, services } = &graph.nodes["/low/tenor"];
+    let NodeNames { publishes, subscribes, serves } = &graph.nodes["/low/tenor"];
     let published = ["/low/tenor/song", "/parameter_events", "/rosout", "/songs"];
-    assert_eq!(*outputs, names(&published));
-    assert_eq!(*inputs, names(&["/low/tenor/note"]));
-    assert!(services.contains("/low/tenor/set_parameters"), "{graph:#?}");
-    assert!(graph.nodes["/alto"].outputs.contains("/songs"));
+    assert_eq!(*publishes, names(&published));
+    assert_eq!(*subscribes, names(&["/low/tenor/note"]));
+    assert!(serves.contains("/low/tenor/set_parameters"), "{graph:#?}");
+    assert!(graph.nodes["/alto"].publishes.contains("/songs"));
     let all: BTreeSet<String> = graph.outputs.iter().map(|it| it.topic.clone()).collect();
     let others = ["/alto/song"];
     assert_eq!(all, &names(&published) | &names(&others));

@@ -11,7 +11,7 @@ use link::clock::now;
 use link::control::{
     Exit, FromCloud, FromRobot, Graph, Hello, InputChannel, NodeLaunch, OutputChannel, ServiceChannel, Welcome,
 };
-use link::record::{Data, Record};
+use link::record::{Call, Data, Record};
 use link::session::{receive_open, send_open};
 use link::{DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use parking_lot::Mutex;
@@ -87,7 +87,7 @@ pub fn hub(bus: Arc<dyn Bus>, nodes: Arc<dyn NodeController>, definitions: &[(&s
 async fn send_hello(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
     let (theirs, ours) = tokio::io::duplex(1 << 16);
     let hub = Arc::clone(hub);
-    tokio::spawn(async move { hub.serve(theirs, &[]).await });
+    tokio::spawn(async move { hub.serve_until(theirs, &[], std::future::pending()).await });
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.expect("a connection");
     let mut held = Budget::without_limit().permit();
@@ -128,7 +128,7 @@ struct CloudRequestForwarder {
     notices: watch::Sender<Vec<String>>,
     /// Changed parameters, in order.
     changes: watch::Sender<Vec<ParamChange>>,
-    /// By channel: the number of messages that late subscribers are given.
+    /// Number of messages that late subscribers are given, by channel.
     kept: watch::Sender<HashMap<u32, usize>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
     answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
@@ -140,7 +140,9 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
         match record {
             Record::Data(data) => drop(self.heard.send((data.channel, data.message))),
             Record::Answer { id, response, .. } => drop(self.answers.send((id, response))),
-            Record::Call { id, service, request } => drop(self.asked.send(CloudRequest::Call(id, service, request))),
+            Record::Call(Call { id, service, request }) => {
+                drop(self.asked.send(CloudRequest::Call(id, service, request)))
+            }
             Record::Control(FromCloud::Lookup { service }) => {
                 drop(self.asked.send(CloudRequest::Lookup(service)));
             }
@@ -240,7 +242,7 @@ impl LinkedRobot {
 
     /// Returns the number of messages of an output that late subscribers are given, if the cloud has told it.
     #[allow(dead_code, reason = "not every test that includes this file has late subscribers")]
-    pub fn kept(&self, output: &OutputChannel) -> Option<usize> {
+    pub fn kept_count(&self, output: &OutputChannel) -> Option<usize> {
         self.ear.kept.borrow().get(&output.channel).copied()
     }
 

@@ -15,8 +15,11 @@ use tokio_tungstenite::tungstenite::protocol::{Message, Role};
 
 use super::lab::{LONG, Lab, wait_graph};
 
-const DEFINITIONS: [(&str, &str); 6] = [
+const DEFINITIONS: [(&str, &str); 9] = [
+    ("std_msgs/msg/Float64MultiArray", "MultiArrayLayout layout\nfloat64[] data\n"),
     ("std_msgs/msg/Int32", "int32 data\n"),
+    ("std_msgs/msg/MultiArrayDimension", "string label\nuint32 size\nuint32 stride\n"),
+    ("std_msgs/msg/MultiArrayLayout", "MultiArrayDimension[] dim\nuint32 data_offset\n"),
     ("std_msgs/msg/String", "string data\n"),
     ("std_srvs/srv/SetBool", "bool data\n---\nbool success\nstring message\n"),
     ("std_srvs/srv/Trigger", "---\nbool success\nstring message\n"),
@@ -26,7 +29,7 @@ const DEFINITIONS: [(&str, &str); 6] = [
 
 /// Encoding that a robot uses.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum RosbridgeFormat {
+pub(super) enum RosbridgeFormat {
     Json,
     Cbor,
 }
@@ -34,13 +37,13 @@ enum RosbridgeFormat {
 const BOTH: [RosbridgeFormat; 2] = [RosbridgeFormat::Json, RosbridgeFormat::Cbor];
 
 /// The bridge of a ROS 2 servant.
-struct BridgedServant {
+pub(super) struct BridgedServant {
     bus: Arc<Ros2Bus>,
     bridge: Arc<Bridge>,
 }
 
 impl BridgedServant {
-    async fn start(lab: &Lab) -> Self {
+    pub(super) async fn start(lab: &Lab) -> Self {
         let bus = lab.join("/cloudroid_bridge").await;
         let registry = Registry::for_version(RosVersion::Two);
         for (name, text) in DEFINITIONS {
@@ -53,11 +56,11 @@ impl BridgedServant {
     }
 
     /// Waits until its graph satisfies a condition.
-    async fn wait_graph(&self, wanted: impl Fn(&Graph) -> bool) {
+    pub(super) async fn wait_graph(&self, wanted: impl Fn(&Graph) -> bool) {
         wait_graph(&self.bus, wanted).await;
     }
 
-    async fn robot(&self, speaks: RosbridgeFormat) -> RosbridgeRobot {
+    pub(super) async fn robot(&self, speaks: RosbridgeFormat) -> RosbridgeRobot {
         let (ours, theirs) = tokio::io::duplex(64 * 1024);
         let bridge = Arc::clone(&self.bridge);
         tokio::spawn(async move { bridge.serve(theirs, SessionOptions::default()).await });
@@ -67,13 +70,13 @@ impl BridgedServant {
 }
 
 /// A client of rosbridge.
-struct RosbridgeRobot {
+pub(super) struct RosbridgeRobot {
     socket: WebSocketStream<DuplexStream>,
     speaks: RosbridgeFormat,
 }
 
 impl RosbridgeRobot {
-    async fn send(&mut self, op: Value) {
+    pub(super) async fn send(&mut self, op: Value) {
         let message = match self.speaks {
             RosbridgeFormat::Json => Message::text(op.to_string()),
             RosbridgeFormat::Cbor => {
@@ -100,7 +103,7 @@ impl RosbridgeRobot {
     }
 
     /// Returns the next message, which must have this operation.
-    async fn receive(&mut self, op: &str) -> Value {
+    pub(super) async fn receive(&mut self, op: &str) -> Value {
         let heard = self.next(op).await;
         assert_eq!(heard["op"], op, "{heard}");
         heard
@@ -117,7 +120,8 @@ impl RosbridgeRobot {
         }
     }
 
-    async fn next(&mut self, awaited: &str) -> Value {
+    /// Returns the next frame except pings and pongs.
+    pub(super) async fn next_frame(&mut self, awaited: &str) -> Message {
         let next = timeout(LONG, async {
             loop {
                 match self.socket.next().await.expect("a session") {
@@ -126,8 +130,11 @@ impl RosbridgeRobot {
                 }
             }
         });
-        let message = next.await.unwrap_or_else(|_| panic!("{awaited} should come"));
-        let (spoken, heard) = match message {
+        next.await.unwrap_or_else(|_| panic!("{awaited} should come"))
+    }
+
+    async fn next(&mut self, awaited: &str) -> Value {
+        let (spoken, heard) = match self.next_frame(awaited).await {
             Message::Text(text) => (RosbridgeFormat::Json, serde_json::from_str(&text).expect("JSON")),
             Message::Binary(bytes) => (RosbridgeFormat::Cbor, from_cbor(&bytes)),
             other => panic!("{other:?} instead of {awaited}"),
@@ -321,10 +328,7 @@ async fn services_are_called_both_ways() {
         robot.send_first("advertise_service", json!({"service": "/ask", "type": "std_srvs/SetBool"})).await;
         peer.tell("call true").await;
         let asked = robot.receive("call_service").await;
-        assert_eq!(
-            (&asked["service"], &asked["type"], &asked["args"]),
-            (&json!("/ask"), &json!("std_srvs/srv/SetBool"), &json!({"data": true}))
-        );
+        assert_eq!((&asked["service"], &asked["args"]), (&json!("/ask"), &json!({"data": true})));
         robot
             .send(json!({"op": "service_response", "id": asked["id"], "service": "/ask",
                 "values": {"success": true, "message": "by a robot"}, "result": true}))

@@ -44,7 +44,7 @@ async fn a_node_answers_calls() {
     }
 }
 
-/// As the first operation of a bus.
+/// Tests a call that is the first operation of a bus.
 #[tokio::test]
 async fn a_call_waits_until_both_ends_know_each_other() {
     let lab = Lab::new();

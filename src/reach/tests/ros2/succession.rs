@@ -1,4 +1,4 @@
-//! Our node is killed together with the daemon and comes back: nodes must not wait for the dead one, whose lease has
+//! The bridge's node is killed with the daemon and comes back: nodes must not wait for the dead one, whose lease has
 //! not expired.
 
 use std::sync::Arc;

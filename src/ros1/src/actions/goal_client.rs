@@ -16,7 +16,7 @@ use super::messages::{self, ActionlibStatus, GoalId};
 const LOST_AFTER: Duration = Duration::from_secs(5);
 /// Time after which a goal that the server never listed is lost. It is much longer: actionlib clients wait forever for
 /// that, because a server may be slow, or another one may take the goal in its place.
-const NEVER_TAKEN: Duration = Duration::from_secs(60);
+const ACCEPT_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The goals of one client, followed by what their server publishes.
 #[derive(Default)]
@@ -29,12 +29,12 @@ struct TrackedGoal {
     seen: Instant,
     /// Time for which the server may leave the goal unmentioned.
     patience: Duration,
-    /// What the server has shown of the goal so far.
+    /// Progress of the goal as far as the server has shown it.
     progress: GoalProgress,
     events: Arc<dyn GoalEvents>,
 }
 
-/// What a server's status list shows of a goal.
+/// Progress of a goal as a server's status list shows it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 struct GoalProgress {
     waits: bool,
@@ -67,7 +67,7 @@ impl GoalProgress {
 
 impl TrackedGoal {
     fn new(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
-        Self { seen: now, patience: NEVER_TAKEN, progress: GoalProgress::default(), events }
+        Self { seen: now, patience: ACCEPT_TIMEOUT, progress: GoalProgress::default(), events }
     }
 
     /// Returns what this status shows for the first time.
@@ -199,9 +199,9 @@ mod tests {
     use super::super::messages::GoalState;
     use super::*;
 
-    /// What a goal's sender is told.
+    /// An event that is reported to a goal's sender.
     #[derive(Debug, Clone, PartialEq)]
-    enum Told {
+    enum GoalUpdate {
         Waiting,
         Accepted,
         Cancelling(bool),
@@ -210,34 +210,34 @@ mod tests {
     }
 
     #[derive(Default)]
-    struct Sender(Mutex<Vec<Told>>);
+    struct Sender(Mutex<Vec<GoalUpdate>>);
 
     impl Sender {
-        fn told(&self) -> Vec<Told> {
+        fn take_updates(&self) -> Vec<GoalUpdate> {
             std::mem::take(&mut *self.0.lock())
         }
     }
 
     impl GoalEvents for Sender {
         fn on_waiting(&self) {
-            self.0.lock().push(Told::Waiting);
+            self.0.lock().push(GoalUpdate::Waiting);
         }
 
         fn on_accepted(&self) {
-            self.0.lock().push(Told::Accepted);
+            self.0.lock().push(GoalUpdate::Accepted);
         }
 
         fn on_cancel_response(&self, ends: bool) {
-            self.0.lock().push(Told::Cancelling(ends));
+            self.0.lock().push(GoalUpdate::Cancelling(ends));
         }
 
         fn on_feedback(&self, _: Bytes) {
-            self.0.lock().push(Told::Feedback);
+            self.0.lock().push(GoalUpdate::Feedback);
         }
 
         fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
             let end = end.map(|end| end.outcome).map_err(|error| error.to_string());
-            self.0.lock().push(Told::Ended(end));
+            self.0.lock().push(GoalUpdate::Ended(end));
         }
     }
 
@@ -265,7 +265,7 @@ mod tests {
     #[test]
     fn a_status_is_reported_once_whatever_was_missed_before() {
         use ActionlibStatus::*;
-        use Told::{Accepted, Cancelling, Waiting};
+        use GoalUpdate::{Accepted, Cancelling, Waiting};
         for (statuses, expected) in [
             (vec![Pending, Pending, Active, Preempting, Preempted], vec![Waiting, Accepted, Cancelling(true)]),
             (vec![Active, Active, Succeeded], vec![Accepted]),
@@ -277,7 +277,7 @@ mod tests {
             let client = GoalClient::default();
             let sender = client.send("one");
             statuses.iter().for_each(|status| client.hear_status(&[state("one", *status)]));
-            assert_eq!(sender.told(), expected, "{statuses:?}");
+            assert_eq!(sender.take_updates(), expected, "{statuses:?}");
         }
     }
 
@@ -287,11 +287,11 @@ mod tests {
         let sender = client.send("one");
         let preempting = [state("one", ActionlibStatus::Preempting)];
         client.hear_status(&preempting);
-        assert_eq!(sender.told(), [Told::Accepted, Told::Cancelling(true)]);
+        assert_eq!(sender.take_updates(), [GoalUpdate::Accepted, GoalUpdate::Cancelling(true)]);
         assert!(client.cancel("one").is_some() && client.cancel("two").is_none());
         client.hear_status(&preempting);
         client.hear_status(&preempting);
-        assert_eq!(sender.told(), [Told::Cancelling(true)]);
+        assert_eq!(sender.take_updates(), [GoalUpdate::Cancelling(true)]);
     }
 
     #[test]
@@ -301,14 +301,14 @@ mod tests {
         let feedback = messages::write_state(Time::default(), &state("one", ActionlibStatus::Active), &[]);
         client.on_feedback(&feedback);
         client.on_feedback(&feedback);
-        assert_eq!(one.told(), [Told::Accepted, Told::Feedback, Told::Feedback]);
+        assert_eq!(one.take_updates(), [GoalUpdate::Accepted, GoalUpdate::Feedback, GoalUpdate::Feedback]);
         // Before any status.
         client.hear_result(&state("one", ActionlibStatus::Preempted));
         client.hear_result(&state("two", ActionlibStatus::Rejected));
         client.hear_status(&[state("one", ActionlibStatus::Preempted), state("two", ActionlibStatus::Rejected)]);
         client.on_feedback(&feedback);
-        assert_eq!(one.told(), [Told::Ended(Ok(GoalOutcome::Canceled))]);
-        assert_eq!(two.told(), [Told::Ended(Ok(GoalOutcome::Rejected))]);
+        assert_eq!(one.take_updates(), [GoalUpdate::Ended(Ok(GoalOutcome::Canceled))]);
+        assert_eq!(two.take_updates(), [GoalUpdate::Ended(Ok(GoalOutcome::Rejected))]);
     }
 
     #[test]
@@ -326,7 +326,7 @@ mod tests {
             let client = GoalClient::default();
             let sender = client.send("one");
             client.hear_result(&state("one", status));
-            assert_eq!(sender.told(), [Told::Ended(Ok(expected))], "{status:?}");
+            assert_eq!(sender.take_updates(), [GoalUpdate::Ended(Ok(expected))], "{status:?}");
         }
     }
 
@@ -345,11 +345,11 @@ mod tests {
         let client = GoalClient::default();
         let sender = client.send("one");
         client.end_all(&GoalError::ServerGone("/do".to_owned()));
-        assert_eq!(sender.told(), [Told::Ended(Err("action server /do is gone".to_owned()))]);
+        assert_eq!(sender.take_updates(), [GoalUpdate::Ended(Err("action server /do is gone".to_owned()))]);
         let sender = client.send("two");
         let cancels: Vec<_> = client.abandon().iter().filter_map(|cancel| messages::read_cancel(cancel)).collect();
         assert_eq!(cancels, [GoalId { id: "two".to_owned(), ..GoalId::default() }]);
         client.hear_result(&state("two", ActionlibStatus::Preempted));
-        assert_eq!(sender.told(), []);
+        assert_eq!(sender.take_updates(), []);
     }
 }

@@ -21,6 +21,9 @@
 //!
 //! A goal that is begun waits for `accept`; feedback counts as such, because only a goal that is executed has any. A
 //! cancel may overtake its goal, which arrives on another topic: then it is remembered.
+//!
+//! Each status lists all goals. It is published periodically and at changes, which whoever sends goals and cancels can
+//! cause without end; so those beyond a rate wait for the next periodic one.
 
 mod table;
 #[cfg(test)]
@@ -35,15 +38,19 @@ use parking_lot::Mutex;
 use ros_bus::{GoalEnd, GoalOutcome};
 use ros_message::codec::{Time, default_message};
 use ros_message::schema::ActionDef;
+use tokio::time::Instant;
 
 use self::table::{GoalTable, Received};
+use super::STATUS_PERIOD;
 use super::messages::{self, GoalState};
 
+/// Maximum number of statuses that are published at changes within a [`STATUS_PERIOD`].
+const MOST_AT_CHANGES: u32 = 16;
 /// Maximum length in bytes of a goal's id, which each status repeats.
 const LONGEST_ID: usize = 1024;
 
 /// Goals that were sent without an id so far.
-static UNNAMED: AtomicU64 = AtomicU64::new(1);
+static UNNAMED_GOALS: AtomicU64 = AtomicU64::new(1);
 
 /// Topics to which a server publishes. Must not block, and must not call the server.
 pub trait GoalServerTopics: Send + Sync + 'static {
@@ -62,7 +69,7 @@ pub struct GoalLimits {
     pub goals: usize,
     /// Budget for goals that have not ended.
     pub budget: Budget,
-    /// Whose goals they are, for the reason of a rejection: `this robot`.
+    /// Owner of the goals, for the reason of a rejection: `this robot`.
     pub holder: &'static str,
 }
 
@@ -73,7 +80,26 @@ pub struct GoalServer<T> {
     topics: T,
     goals: Mutex<GoalTable>,
     /// Held while something is published, so that the last status is current and no feedback follows a result.
-    telling: Mutex<()>,
+    telling: Mutex<StatusRate>,
+}
+
+/// Statuses that were published at changes since some time.
+#[derive(Default)]
+struct StatusRate {
+    since: Option<Instant>,
+    published: u32,
+}
+
+impl StatusRate {
+    /// Returns whether another one may be published now, which counts as done.
+    fn admit(&mut self) -> bool {
+        if self.since.is_none_or(|since| since.elapsed() >= STATUS_PERIOD) {
+            *self = Self { since: Some(Instant::now()), published: 0 };
+        }
+        let has_room = self.published < MOST_AT_CHANGES;
+        self.published += u32::from(has_room);
+        has_room
+    }
 }
 
 impl<T: GoalServerTopics> GoalServer<T> {
@@ -108,7 +134,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
             return None;
         };
         if goal.id.is_empty() {
-            goal.id = format!("{action}-{}", UNNAMED.fetch_add(1, Ordering::Relaxed));
+            goal.id = format!("{action}-{}", UNNAMED_GOALS.fetch_add(1, Ordering::Relaxed));
         }
         if goal.id.len() > LONGEST_ID {
             tracing::debug!(action, bytes = goal.id.len(), "a goal with an overlong id was ignored");
@@ -123,8 +149,8 @@ impl<T: GoalServerTopics> GoalServer<T> {
                 None
             }
             Received::Ended(state) => {
-                let _telling = self.telling.lock();
-                self.tell_end(&state, &default_message(&self.of.result));
+                let mut telling = self.telling.lock();
+                self.tell_end(&state, &default_message(&self.of.result), &mut telling);
                 None
             }
         }
@@ -132,8 +158,8 @@ impl<T: GoalServerTopics> GoalServer<T> {
 
     /// Marks a goal as being executed; does nothing if it is already, or has ended.
     pub fn accept(&self, id: &str) {
-        let _telling = self.telling.lock();
-        self.tell_accepted(id);
+        let mut telling = self.telling.lock();
+        self.tell_accepted(id, &mut telling);
     }
 
     /// Cancels goals by actionlib's policy: an empty id means all goals up to the stamp, and with a zero stamp all
@@ -146,7 +172,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
             return Vec::new();
         };
         let cancelled = self.goals.lock().cancel(wanted);
-        self.publish_status();
+        self.announce_status();
         cancelled
     }
 
@@ -157,8 +183,8 @@ impl<T: GoalServerTopics> GoalServer<T> {
 
     /// Publishes feedback for a goal; returns false if no goal with this id is active.
     pub fn publish_feedback(&self, id: &str, feedback: &[u8]) -> bool {
-        let _telling = self.telling.lock();
-        self.tell_accepted(id);
+        let mut telling = self.telling.lock();
+        self.tell_accepted(id, &mut telling);
         let state = self.goals.lock().state_under_way(id);
         if let Some(state) = &state {
             self.topics.publish_feedback(messages::write_state(Time::now(), state, feedback));
@@ -168,10 +194,10 @@ impl<T: GoalServerTopics> GoalServer<T> {
 
     /// Ends a goal; returns false if no goal with this id is active.
     pub fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
-        let _telling = self.telling.lock();
+        let mut telling = self.telling.lock();
         let ended = self.goals.lock().end(id, end.outcome, end.text);
         if let Some(state) = &ended {
-            self.tell_end(state, &end.result);
+            self.tell_end(state, &end.result, &mut telling);
         }
         ended.is_some()
     }
@@ -182,26 +208,37 @@ impl<T: GoalServerTopics> GoalServer<T> {
     }
 
     /// Publishes the statuses of all goals, without those that ended some time ago. It is to be called every
-    /// [`STATUS_PERIOD`](super::STATUS_PERIOD).
+    /// [`STATUS_PERIOD`].
     pub fn publish_status(&self) {
         let _telling = self.telling.lock();
-        self.tell_status();
+        self.write_status();
     }
 
-    fn tell_accepted(&self, id: &str) {
+    /// Publishes the statuses because one has changed, unless that happens too often.
+    pub fn announce_status(&self) {
+        self.tell_status(&mut self.telling.lock());
+    }
+
+    fn tell_accepted(&self, id: &str, telling: &mut StatusRate) {
         let changed = self.goals.lock().accept(id);
         if changed {
-            self.tell_status();
+            self.tell_status(telling);
         }
     }
 
     /// Publishes the result before the status, as actionlib does.
-    fn tell_end(&self, state: &GoalState, result: &[u8]) {
+    fn tell_end(&self, state: &GoalState, result: &[u8], telling: &mut StatusRate) {
         self.topics.publish_result(messages::write_state(Time::now(), state, result));
-        self.tell_status();
+        self.tell_status(telling);
     }
 
-    fn tell_status(&self) {
+    fn tell_status(&self, telling: &mut StatusRate) {
+        if telling.admit() {
+            self.write_status();
+        }
+    }
+
+    fn write_status(&self) {
         let states = self.goals.lock().states();
         self.topics.publish_status(messages::write_states(Time::now(), states.iter()));
     }

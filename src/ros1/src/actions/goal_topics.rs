@@ -179,7 +179,7 @@ impl<C: ActionClient + 'static> GoalTopics<C> {
         let Some((id, goal)) = self.goals.begin(message) else {
             return;
         };
-        self.goals.publish_status();
+        self.goals.announce_status();
         let events = TopicsGoalEvents {
             // It receives the end of the goal even if nobody subscribes any more.
             topics: Arc::clone(self),

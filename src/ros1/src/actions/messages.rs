@@ -28,7 +28,7 @@ pub enum ActionlibStatus {
     Recalling = 7,
     /// Cancelled before execution.
     Recalled = 8,
-    /// Not heard of by the client for a long time.
+    /// The client has not heard of the goal for a long time.
     Lost = 9,
 }
 

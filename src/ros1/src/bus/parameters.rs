@@ -54,7 +54,11 @@ impl GlobalParameters for Ros1Bus {
     async fn watch(&self) -> Result<ParamChangeReceiver, BusError> {
         self.inner.check_open()?;
         let (teller, changes) = param_change_channel(&self.inner.frames.budget);
-        *self.inner.param_watcher.lock() = Some(teller);
+        {
+            let mut watchers = self.inner.param_watchers.lock();
+            watchers.retain(|watcher| !watcher.is_closed());
+            watchers.push(teller);
+        }
         self.inner.subscribe_params().await?;
         Ok(changes)
     }

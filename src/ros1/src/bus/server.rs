@@ -20,7 +20,7 @@ const MAX_CONNECTIONS: usize = 4000;
 /// publisher to which it is still connected: if it were sent away and the topic advertised before it noticed, it would
 /// never come back. Longer than a query for the subscribers' types takes, which is often followed by a publication of
 /// ours.
-const READVERTISED: Duration = Duration::from_secs(4);
+const ADVERTISE_TIMEOUT: Duration = Duration::from_secs(4);
 
 /// Serves until dropped, which also ends every connection.
 pub(super) async fn serve(bus: Arc<Ros1BusState>, listener: TcpListener) {
@@ -62,10 +62,10 @@ struct PendingSubscriber<'a> {
 }
 
 impl PendingSubscriber<'_> {
-    /// Waits until the topic is advertised; `None` if that takes longer than [`READVERTISED`]. Queries that arrive
+    /// Waits until the topic is advertised; `None` if that takes longer than [`ADVERTISE_TIMEOUT`]. Queries that arrive
     /// meanwhile are told the requested type, and restart the time limit.
     async fn wait_until_advertised(&mut self) -> Option<(Arc<TopicOut>, WireType, bool)> {
-        let mut latest = Instant::now() + READVERTISED;
+        let mut latest = Instant::now() + ADVERTISE_TIMEOUT;
         loop {
             let mut next = std::pin::pin!(self.bus.publishing.notified());
             next.as_mut().enable();
@@ -73,7 +73,7 @@ impl PendingSubscriber<'_> {
             if let Some(topic) = topic {
                 if let Some(told) = topic.forward_requested_type(self.asked, self.told) {
                     self.told = Some(told);
-                    latest = Instant::now() + READVERTISED;
+                    latest = Instant::now() + ADVERTISE_TIMEOUT;
                 }
                 if let Some((advert, latching)) = topic.advert() {
                     return Some((topic, advert, latching));

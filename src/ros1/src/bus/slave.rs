@@ -4,6 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use async_trait::async_trait;
+use budget::Exceeded;
+use ros_bus::ParamValue;
 
 use super::Ros1BusState;
 use crate::master::lending::LEND_SERVICE;
@@ -53,18 +55,29 @@ impl Slave {
         args.text("caller_id")?;
         let key = names::canonical(&args.text("key")?);
         // A deletion is announced as an empty dictionary.
-        let value = match args.value("value")? {
+        let value: Option<ParamValue> = match args.value("value")? {
             Value::Struct(members) if members.is_empty() => None,
             value => Some(value.into()),
         };
-        if let Some(watcher) = &*self.bus.param_watcher.lock() {
-            if let Err(error) = watcher.send(key.clone(), value) {
-                // The other watchers are notified all the same, and reading the parameter returns the new value.
+        match self.report_change(&key, value.as_ref()) {
+            Ok(()) => Ok(ApiReply::success("", 0)),
+            Err(error) => {
+                // Reading the parameter returns the new value.
                 tracing::warn!("a change of the parameter {key} was not reported: {error}");
-                return Ok(ApiReply::failure(error.to_string(), 0));
+                Ok(ApiReply::failure(error.to_string(), 0))
             }
         }
-        Ok(ApiReply::success("", 0))
+    }
+
+    /// Reports a change to each watcher. One that has no room does not keep it from the others.
+    fn report_change(&self, key: &str, value: Option<&ParamValue>) -> Result<(), Exceeded> {
+        let mut watchers = self.bus.param_watchers.lock();
+        watchers.retain(|watcher| !watcher.is_closed());
+        let mut reported = Ok(());
+        for watcher in watchers.iter() {
+            reported = reported.and(watcher.send(key.to_owned(), value.cloned()));
+        }
+        reported
     }
 
     fn request_topic(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {

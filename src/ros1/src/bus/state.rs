@@ -46,7 +46,8 @@ pub(crate) struct Ros1BusState {
     pub(super) publisher_clients: PublisherClients,
     pub(crate) graph: watch::Sender<Arc<Graph>>,
     pub(super) shutdown: watch::Sender<Option<String>>,
-    pub(super) param_watcher: Mutex<Option<ParamChangeSender>>,
+    /// Watchers of all parameters; those that are gone are removed when something changes.
+    pub(super) param_watchers: Mutex<Vec<ParamChangeSender>>,
     pub(super) closed: AtomicBool,
     pub(super) runtime: Handle,
     /// Span of the log in which the bus was joined, for all its tasks.

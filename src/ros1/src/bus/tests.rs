@@ -11,7 +11,7 @@ use ros_bus::net::HostSockets;
 use ros_bus::{MessageReceiver, PeerId, SerializedMessage};
 
 use super::*;
-use crate::testing::{LONG, TestMaster};
+use crate::testing::{PATIENCE, TestMaster};
 
 pub(super) async fn join(master: &TestMaster, name: &str) -> Arc<Ros1Bus> {
     let sockets = Arc::new(HostSockets);
@@ -35,13 +35,13 @@ pub(super) async fn subscribe_text(bus: &Ros1Bus, topic: &str) -> Subscription {
 /// Waits until `count` subscribers are connected.
 pub(super) async fn wait_for_subscribers(publisher: &dyn Publisher, count: usize) {
     let mut now = publisher.matched_subscribers();
-    let reached = tokio::time::timeout(LONG, now.wait_for(|now| now.connected_count() == count));
+    let reached = tokio::time::timeout(PATIENCE, now.wait_for(|now| now.connected_count() == count));
     reached.await.expect("subscribers should connect").unwrap();
 }
 
 /// Returns the next message, with a time limit.
 pub(super) async fn next(messages: &mut MessageReceiver) -> SerializedMessage {
-    let message = tokio::time::timeout(LONG, messages.recv()).await;
+    let message = tokio::time::timeout(PATIENCE, messages.recv()).await;
     message.expect("a message should come").expect("not the end")
 }
 
@@ -52,7 +52,7 @@ pub(super) async fn next_text(messages: &mut MessageReceiver) -> String {
 /// Waits until the bus's graph satisfies `wanted`.
 pub(super) async fn wait_for_graph(bus: &Ros1Bus, wanted: impl Fn(&Graph) -> bool) {
     let mut graph = bus.graph();
-    let found = tokio::time::timeout(LONG, graph.wait_for(|graph| wanted(graph)));
+    let found = tokio::time::timeout(PATIENCE, graph.wait_for(|graph| wanted(graph)));
     let found = found.await.is_ok();
     assert!(found, "{:#?}", bus.graph().borrow());
 }

@@ -10,7 +10,7 @@ use tokio::time::sleep;
 use super::Ros1BusState;
 use super::master_client::to_bus_error;
 use crate::actions;
-use crate::master::graph::{WAIT_GRAPH, from_value, wire_generation};
+use crate::master::graph::{GraphAnswer, WAIT_GRAPH, wire_generation};
 use crate::xmlrpc::{self, Value};
 
 /// Duration of one long poll in seconds, and the grace period for its answer. The end of a Master is noticed at once by
@@ -25,7 +25,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// Time for which a Master may be silent before a warning is logged: when one ends, its bus ends a moment later.
 const SILENCE: Duration = Duration::from_secs(3);
 
-/// Pause after a poll, per part of the graph, and its maximum. A graph is read, compared and shown as a whole. A node
+/// Pause after a poll, per part of the graph, and its maximum. A graph is compared and shown as a whole. A node
 /// that keeps changing a large one would keep us busy; the pause is many times as long as the poll took.
 const REST: Duration = Duration::from_micros(25);
 const LONGEST_REST: Duration = Duration::from_secs(1);
@@ -78,8 +78,8 @@ pub(super) async fn start(bus: Arc<Ros1BusState>) -> Result<Watcher, BusError> {
 
 /// Returns the current graph.
 pub(super) async fn fetch(bus: &Arc<Ros1BusState>) -> Result<Graph, BusError> {
-    let graph = match wait_graph(bus, -1, 0).await {
-        Ok((graph, _)) => graph,
+    let graph = match wait_graph(bus, -1, "", 0).await {
+        Ok(answer) => answer.graph,
         Err(xmlrpc::Error::Fault { .. }) => poll_graph(bus).await.map_err(to_bus_error)?,
         Err(error) => return Err(to_bus_error(error)),
     };
@@ -117,13 +117,14 @@ impl Watcher {
     async fn refresh(&mut self) -> Result<Duration, xmlrpc::Error> {
         let first = self.known == -1;
         let graph = if self.waits {
-            match wait_graph(&self.bus, self.known, POLL).await {
-                Ok((graph, run_id)) => {
-                    if !self.run_id.is_empty() && self.run_id != run_id {
-                        tracing::info!(run_id, "the ROS Master was replaced");
+            match wait_graph(&self.bus, self.known, &self.run_id, POLL).await {
+                Ok(answer) => {
+                    if !self.run_id.is_empty() && self.run_id != answer.run_id {
+                        tracing::info!(run_id = answer.run_id, "the ROS Master was replaced");
                     }
-                    self.run_id = run_id;
-                    graph
+                    self.run_id.clone_from(&answer.run_id);
+                    let known = self.bus.graph.borrow().clone();
+                    answer.into_whole(&known).ok_or_else(|| unreadable(WAIT_GRAPH))?
                 }
                 Err(xmlrpc::Error::Fault { .. }) => {
                     self.waits = false;
@@ -193,11 +194,12 @@ impl Ros1BusState {
     }
 }
 
-async fn wait_graph(bus: &Ros1BusState, known: i32, seconds: i32) -> Result<(Graph, String), xmlrpc::Error> {
-    let args = vec![known.into(), seconds.into()];
+/// Waits for another generation than the known one of the Master with this run id.
+async fn wait_graph(bus: &Ros1BusState, known: i32, run_id: &str, seconds: i32) -> Result<GraphAnswer, xmlrpc::Error> {
+    let args = vec![known.into(), seconds.into(), run_id.into()];
     let time = Duration::from_secs(u64::from(seconds.unsigned_abs())) + GRACE;
     let reply = bus.master.call_raw(&bus.node, WAIT_GRAPH, args, time).await?;
-    from_value(&reply.value).ok_or_else(|| unreadable(WAIT_GRAPH))
+    GraphAnswer::from_value(&reply.value).ok_or_else(|| unreadable(WAIT_GRAPH))
 }
 
 fn unreadable(method: &str) -> xmlrpc::Error {

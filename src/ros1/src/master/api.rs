@@ -8,7 +8,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 
 use super::MasterCore;
-use super::graph::{self, WAIT_GRAPH, wire_generation};
+use super::graph::{GraphPart, WAIT_GRAPH, wire_generation};
 use super::lending::LEND_SERVICES;
 use super::record_sought;
 use super::registry::{Kind, RegistrationError};
@@ -146,13 +146,16 @@ impl Api {
             Value::Double(seconds) => seconds,
             _ => 0.0,
         };
+        // Callers of an earlier version do not give it.
+        let run_id = args.value("run_id").ok();
         let time = Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(MAX_WAIT);
         let mut generation = self.master.generation.subscribe();
         let news = generation.wait_for(|now| wire_generation(*now) != known);
-        // In either case: the answer always contains the whole state.
+        // In either case: the answer says how the state is now.
         let _ = tokio::time::timeout(time.min(MAX_WAIT), news).await;
-        let graph = self.master.graph();
-        Ok(ApiReply::success("", graph::to_value(&graph, &self.master.run_id)))
+        let is_ours = run_id.as_ref().and_then(Value::as_str) == Some(self.master.run_id.as_str());
+        let answer = self.master.graph_answer(Some(known).filter(|known| is_ours && *known >= 0));
+        Ok(ApiReply::success("", answer.to_value()))
     }
 
     fn registration(&self, method: &str, args: &mut Args) -> Option<Result<ApiReply, ApiReply>> {
@@ -272,6 +275,7 @@ impl Api {
         }
         let mut state = self.master.state.lock();
         if record_sought(&mut state.sought, &service, &caller) {
+            self.master.record_changes(&mut state, [GraphPart::Sought(service)]);
             self.master.bump_generation();
         }
         Err(no_provider())

@@ -5,12 +5,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use ros_bus::TopicNodes;
 
+use super::graph::GraphPart;
 use super::notify::Notice;
 
 /// Maximum number of registrations of all nodes together: a node gone wild must not exhaust the host's memory.
 const MAX_REGISTRATIONS: usize = 50_000;
 /// Maximum number of former addresses recorded per node name.
-const MAX_REPLACED: usize = 16;
+const MAX_FORMER_ADDRESSES: usize = 16;
 /// Type of a topic whose type is still unknown.
 pub(crate) const ANY_TYPE: &str = "*";
 
@@ -66,6 +67,17 @@ struct RegisteredService {
     api: String,
 }
 
+impl Kind {
+    /// Returns the part of the graph that shows such a registration.
+    fn graph_part(self, name: &str) -> Option<GraphPart> {
+        match self {
+            Kind::Publisher | Kind::Subscriber => Some(GraphPart::Topic(name.to_owned())),
+            Kind::Service => Some(GraphPart::Service(name.to_owned())),
+            Kind::Parameter => None,
+        }
+    }
+}
+
 /// All registrations.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Registry {
@@ -76,6 +88,8 @@ pub(super) struct Registry {
     count: usize,
     /// Number of actual changes.
     version: u64,
+    /// Parts of the graph that changed since they were last taken.
+    changed: BTreeSet<GraphPart>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -83,6 +97,18 @@ struct TopicRegistration {
     type_name: String,
     publishers: Vec<String>,
     subscribers: Vec<String>,
+}
+
+impl TopicRegistration {
+    /// Returns its nodes and type; `None` if it has no nodes now.
+    fn nodes(&self) -> Option<TopicNodes> {
+        let is_used = !self.publishers.is_empty() || !self.subscribers.is_empty();
+        is_used.then(|| TopicNodes {
+            type_name: self.type_name.clone(),
+            publishers: self.publishers.clone(),
+            subscribers: self.subscribers.clone(),
+        })
+    }
 }
 
 /// Reason for refusing a registration.
@@ -116,7 +142,7 @@ impl Registry {
             }
             replaced.clone_from(&before.replaced);
             replaced.push(before.api.clone());
-            if replaced.len() > MAX_REPLACED {
+            if replaced.len() > MAX_FORMER_ADDRESSES {
                 replaced.remove(0);
             }
             let reason = "new node registered with same name";
@@ -130,6 +156,10 @@ impl Registry {
         let new = entry.names_mut(kind).insert(name.to_owned());
         self.count += usize::from(new);
         self.version += u64::from(new);
+        if new {
+            self.changed.insert(GraphPart::Node(node.to_owned()));
+            self.changed.extend(kind.graph_part(name));
+        }
         match kind {
             Kind::Publisher | Kind::Subscriber => {
                 let topic = self.topics.entry(name.to_owned()).or_insert_with(|| TopicRegistration {
@@ -142,6 +172,7 @@ impl Registry {
                 if counts && type_name != ANY_TYPE && type_name != topic.type_name {
                     topic.type_name = type_name.to_owned();
                     self.version += 1;
+                    self.changed.insert(GraphPart::Topic(name.to_owned()));
                 }
                 if new {
                     let ends = match kind {
@@ -195,6 +226,7 @@ impl Registry {
             return;
         };
         self.version += 1;
+        self.changed.insert(GraphPart::Node(node.to_owned()));
         let kinds = [
             (Kind::Publisher, gone.publishes),
             (Kind::Subscriber, gone.subscribes),
@@ -235,11 +267,13 @@ impl Registry {
         self.version += 1;
         if entry.is_idle() {
             self.nodes.remove(node);
+            self.changed.insert(GraphPart::Node(node.to_owned()));
         }
     }
 
     /// Removes a registration from the topic's or service's side.
     fn detach(&mut self, kind: Kind, name: &str, node: &str, notices: &mut Vec<Notice>) {
+        self.changed.extend(kind.graph_part(name));
         match kind {
             Kind::Publisher => {
                 if let Some(topic) = self.topics.get_mut(name) {
@@ -285,6 +319,11 @@ impl Registry {
         known.map(|node| node.api.clone()).collect()
     }
 
+    /// Takes the parts of the graph that changed since the last call.
+    pub(super) fn take_changed(&mut self) -> BTreeSet<GraphPart> {
+        std::mem::take(&mut self.changed)
+    }
+
     /// Returns the number of actual changes.
     pub(super) fn version(&self) -> u64 {
         self.version
@@ -322,16 +361,17 @@ impl Registry {
 
     /// Iterates over the topics that have publishers or subscribers now.
     pub(super) fn topics(&self) -> impl Iterator<Item = (&str, TopicNodes)> {
-        self.topics.iter().filter(|(_, topic)| !topic.publishers.is_empty() || !topic.subscribers.is_empty()).map(
-            |(name, topic)| {
-                let ends = TopicNodes {
-                    type_name: topic.type_name.clone(),
-                    publishers: topic.publishers.clone(),
-                    subscribers: topic.subscribers.clone(),
-                };
-                (name.as_str(), ends)
-            },
-        )
+        self.topics.iter().filter_map(|(name, topic)| Some((name.as_str(), topic.nodes()?)))
+    }
+
+    /// Returns a topic that has publishers or subscribers now.
+    pub(super) fn topic(&self, name: &str) -> Option<TopicNodes> {
+        self.topics.get(name)?.nodes()
+    }
+
+    /// Returns the node that serves a service.
+    pub(super) fn service_node(&self, service: &str) -> Option<&str> {
+        self.services.get(service).map(|found| found.node.as_str())
     }
 
     /// Returns the addresses of parameter subscribers, by the key they subscribed to.

@@ -4,7 +4,7 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 
 use super::*;
-use crate::testing::{LONG, TestMaster, TestNode, args};
+use crate::testing::{PATIENCE, TestMaster, TestNode, args};
 use crate::xmlrpc::XmlRpcClient;
 
 /// An address at which nobody listens.
@@ -86,7 +86,7 @@ async fn the_callers_mistakes_are_named() {
     }
     let uri = format!("http://{}/", master.address);
     let client = XmlRpcClient::new(Arc::new(HostSockets), &uri).unwrap();
-    let fault = client.call("sing", &[], LONG).await.unwrap_err();
+    let fault = client.call("sing", &[], PATIENCE).await.unwrap_err();
     assert!(fault.to_string().contains("sing is not known"), "{fault}");
     assert_eq!(master.master.graph().nodes.len(), 0);
 }
@@ -164,7 +164,7 @@ async fn a_successor_may_have_the_address_of_one_who_is_dead() {
     // port.
     assert_eq!(register(NOWHERE).await, 1);
     assert_eq!(register(&new.uri).await, 1);
-    tokio::time::timeout(LONG, async {
+    tokio::time::timeout(PATIENCE, async {
         while register(NOWHERE).await != 1 {
             tokio::task::yield_now().await;
         }
@@ -249,37 +249,102 @@ async fn many_calls_in_one_are_answered_one_by_one() {
     ]);
     let uri = format!("http://{}/", master.address);
     let client = XmlRpcClient::new(Arc::new(HostSockets), &uri).unwrap();
-    let answers = client.call("system.multicall", &[calls], LONG).await.unwrap();
+    let answers = client.call("system.multicall", &[calls], PATIENCE).await.unwrap();
     let answers = answers.as_array().unwrap();
     let got = answers[1].as_array().unwrap()[0].as_array().unwrap();
     assert_eq!(got[2], "b".into());
     assert!(answers[2].get("faultString").is_some());
     assert!(answers[3].get("faultString").is_some());
-    let methods = client.call("system.listMethods", &[], LONG).await.unwrap();
+    let methods = client.call("system.listMethods", &[], PATIENCE).await.unwrap();
     assert!(methods.to_strings().contains(&"registerPublisher".to_owned()));
+}
+
+/// Waits for another generation of the graph than the known one.
+async fn wait_graph(master: &TestMaster, known: i32, seconds: i32, run_id: &str) -> GraphAnswer {
+    let list = ["/b".into(), known.into(), seconds.into(), run_id.into()];
+    let (_, _, value) = master.call(graph::WAIT_GRAPH, &list).await;
+    GraphAnswer::from_value(&value).unwrap()
 }
 
 #[tokio::test]
 async fn the_graph_is_waited_for() {
     let master = TestMaster::start().await;
-    let wait = |known: i32, seconds: i32| {
-        let master = &master;
-        async move {
-            let list = ["/b".into(), known.into(), seconds.into()];
-            let (_, _, value) = master.call(graph::WAIT_GRAPH, &list).await;
-            graph::from_value(&value).unwrap()
-        }
-    };
-    let (now, run_id) = wait(-1, 60).await;
-    assert_eq!(run_id, master.master.run_id());
-    let known = graph::wire_generation(now.generation);
+    let now = wait_graph(&master, -1, 60, "").await;
+    assert_eq!(now.run_id, master.master.run_id());
+    let known = wire_generation(now.graph.generation);
     let list = args(["/p", "/t", "a/B", NOWHERE]);
-    let (later, _) = tokio::join!(wait(known, 60), master.call("registerPublisher", &list));
-    assert_eq!(later.0.topics["/t"].type_name, "a/B");
-    let known = graph::wire_generation(later.0.generation);
+    let (later, _) = tokio::join!(wait_graph(&master, known, 60, ""), master.call("registerPublisher", &list));
+    assert_eq!(later.graph.topics["/t"].type_name, "a/B");
+    let known = wire_generation(later.graph.generation);
     // Registering the same again is not a change, so the call times out and answers with the whole state.
-    let (same, _) = tokio::join!(wait(known, 1), master.call("registerPublisher", &list));
-    assert_eq!(same.0, later.0);
+    let (same, _) = tokio::join!(wait_graph(&master, known, 1, ""), master.call("registerPublisher", &list));
+    assert_eq!(same, later);
+}
+
+/// Returns a graph without its number, which grows a moment after a parameter was used.
+fn without_generation(graph: Graph) -> Graph {
+    Graph { generation: 0, ..graph }
+}
+
+#[tokio::test]
+async fn who_knows_the_graph_is_told_what_has_changed_alone() {
+    let master = TestMaster::start().await;
+    let run_id = master.master.run_id().to_owned();
+    for number in 0..100 {
+        master.call("registerPublisher", &args(["/p", &format!("/t{number}"), "a/B", NOWHERE])).await;
+    }
+    let whole = wait_graph(&master, -1, 0, &run_id).await;
+    assert_eq!((whole.since, whole.graph.topics.len()), (None, 100));
+    let known = wire_generation(whole.graph.generation);
+    master.call("unregisterPublisher", &args(["/p", "/t7", NOWHERE])).await;
+    master.call("registerService", &args(["/q", "/s", "rosrpc://127.0.0.1:9", "http://127.0.0.1:10/"])).await;
+    master.call("getParam", &args(["/q", "/k"])).await;
+    master.call("lookupService", &args(["/q", "/nowhere"])).await;
+    let news = wait_graph(&master, known, 60, &run_id).await;
+    assert_eq!((news.since, &news.gone), (Some(known), &[GraphPart::Topic("/t7".to_owned())].into()));
+    let parts = (news.graph.topics.len(), news.graph.services.len(), news.graph.sought.len());
+    assert_eq!(parts, (0, 1, 1), "{news:#?}");
+    assert!(news.graph.nodes.contains_key("/q") && news.graph.parameters.contains_key("/k"), "{news:#?}");
+    let now = wait_graph(&master, -1, 0, &run_id).await.graph;
+    let added = news.clone().into_whole(&whole.graph).map(without_generation);
+    assert_eq!(added, Some(without_generation(now.clone())));
+    // They do not belong to another generation, and another Master's caller gets the whole.
+    assert_eq!(news.into_whole(&now), None);
+    assert_eq!(wait_graph(&master, known, 0, "another").await.since, None);
+}
+
+#[tokio::test]
+async fn differences_add_up_to_the_graph_whatever_happens() {
+    let master = TestMaster::start().await;
+    let run_id = master.master.run_id().to_owned();
+    let mut known = wait_graph(&master, -1, 0, "").await.graph;
+    let mut dice = 7_u64;
+    let mut throw = |sides: u64| {
+        dice = dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (dice >> 33) % sides
+    };
+    for _ in 0..300 {
+        let (node, name) = (format!("/n{}", throw(4)), format!("/x{}", throw(6)));
+        // A node that comes with another address replaces the one before.
+        let api = format!("http://127.0.0.1:{}/", 9 + throw(12) / 11);
+        let by = [node.as_str(), name.as_str()];
+        match throw(8) {
+            0 | 1 => master.call("registerPublisher", &args([by[0], by[1], "a/B", &api])).await,
+            2 => master.call("registerSubscriber", &args([by[0], by[1], "a/C", &api])).await,
+            3 => master.call("registerService", &args([by[0], by[1], "rosrpc://127.0.0.1:9", &api])).await,
+            4 => master.call("unregisterPublisher", &args([by[0], by[1], &api])).await,
+            5 => master.call("unregisterSubscriber", &args([by[0], by[1], &api])).await,
+            6 => master.call("unregisterService", &args([by[0], by[1], "rosrpc://127.0.0.1:9"])).await,
+            _ => master.call("hasParam", &args(by)).await,
+        };
+        if throw(3) == 0 {
+            let news = wait_graph(&master, wire_generation(known.generation), 0, &run_id).await;
+            assert!(news.since.is_some(), "{news:#?}");
+            known = news.into_whole(&known).unwrap();
+            let whole = wait_graph(&master, -1, 0, "").await.graph;
+            assert_eq!(without_generation(known.clone()), without_generation(whole));
+        }
+    }
 }
 
 #[tokio::test]
@@ -327,7 +392,7 @@ async fn answers_that_nobody_reads_take_no_more_than_their_share() {
     for _ in 0..10 {
         streams.push(ask_for_all(&master).await);
     }
-    let first = tokio::time::timeout(LONG, async {
+    let first = tokio::time::timeout(PATIENCE, async {
         loop {
             if let Some(first) = answered_streams(&streams).first() {
                 break *first;
@@ -343,14 +408,14 @@ async fn answers_that_nobody_reads_take_no_more_than_their_share() {
     }
     streams.remove(first);
     // A peer that reads nothing and disconnects makes room for the next.
-    let next = tokio::time::timeout(LONG, async {
+    let next = tokio::time::timeout(PATIENCE, async {
         while answered_streams(&streams).is_empty() {
             tokio::task::yield_now().await;
         }
     });
     next.await.expect("the next has an answer");
     drop(streams);
-    let given_back = tokio::time::timeout(LONG, async {
+    let given_back = tokio::time::timeout(PATIENCE, async {
         while budget.used_bytes() > 0 {
             tokio::task::yield_now().await;
         }
@@ -374,7 +439,7 @@ async fn what_can_never_be_answered_is_a_fault_at_once() {
         Value::Array(vec![Value::Struct(call.into()); count])
     };
     for (method, params) in [("getParam", args(["/x", "/"]).to_vec()), ("system.multicall", vec![calls(1)])] {
-        let fault = client.call(method, &params, LONG).await.unwrap_err();
+        let fault = client.call(method, &params, PATIENCE).await.unwrap_err();
         assert!(fault.to_string().contains("the memory for the Master"), "{fault}");
     }
 }
@@ -390,7 +455,7 @@ async fn parameters_used_one_by_one_are_told_together() {
         master.call("hasParam", &args(["/n", &key])).await;
     }
     master.wait_until(|graph| graph.parameters.len() == count).await;
-    let told = tokio::time::timeout(LONG, generation.changed()).await;
+    let told = tokio::time::timeout(PATIENCE, generation.changed()).await;
     told.expect("it is told").unwrap();
     let grown = *generation.borrow() - before;
     assert!(grown < count as u64 / 2, "{grown} generations");

@@ -17,12 +17,12 @@ use super::Error;
 /// Size from which a message gets its own allocation.
 pub(crate) const BIG: usize = 16 << 10;
 /// Size of the common buffer: initial, and when the stream is busy.
-const FEW: usize = 4 << 10;
-const MANY: usize = 128 << 10;
+const SMALL_BUFFER: usize = 4 << 10;
+const LARGE_BUFFER: usize = 128 << 10;
 /// Size up to which an allocation is reused for the next big message, if nobody holds the previous one any more.
-const REUSED: usize = 8 << 20;
+const MAX_REUSED_SIZE: usize = 8 << 20;
 /// Maximum wait for that message before the allocation is freed.
-const KEPT: Duration = Duration::from_secs(1);
+const REUSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Space reserved for a big message before any of it has arrived; doubled as it arrives.
 const AHEAD: usize = 1 << 20;
 
@@ -40,7 +40,7 @@ pub struct FrameBounds {
 impl From<usize> for FrameBounds {
     /// Limits messages to `max` bytes, with an unlimited budget.
     fn from(max: usize) -> Self {
-        Self { max, budget: Budget::without_limit(), unfinished: super::UNFINISHED }
+        Self { max, budget: Budget::without_limit(), unfinished: super::MESSAGE_TIMEOUT }
     }
 }
 
@@ -60,7 +60,7 @@ impl FrameReader {
     /// Creates a reader that begins with what was already read and takes messages within `bounds`.
     pub fn new(buffer: BytesMut, bounds: impl Into<FrameBounds>) -> Self {
         let bounds = bounds.into();
-        Self { buffer, chunk: FEW, big: None, permit: bounds.budget.permit(), bounds }
+        Self { buffer, chunk: SMALL_BUFFER, big: None, permit: bounds.budget.permit(), bounds }
     }
 
     /// Returns the next message, or `None` when the stream ends between messages.
@@ -122,7 +122,7 @@ impl FrameReader {
         let count = if self.big.is_none() {
             read.await?
         } else {
-            match timeout(KEPT, read).await {
+            match timeout(REUSE_TIMEOUT, read).await {
                 Ok(count) => count?,
                 Err(_) => {
                     self.big = None;
@@ -131,9 +131,9 @@ impl FrameReader {
             }
         };
         if count == room {
-            self.chunk = (self.chunk * 2).min(MANY);
+            self.chunk = (self.chunk * 2).min(LARGE_BUFFER);
         } else if count < self.chunk / 16 {
-            self.chunk = (self.chunk / 2).max(FEW);
+            self.chunk = (self.chunk / 2).max(SMALL_BUFFER);
         }
         Ok(count > 0)
     }
@@ -171,7 +171,7 @@ impl FrameReader {
             }
         }
         let message = big.split().freeze();
-        if size <= REUSED {
+        if size <= MAX_REUSED_SIZE {
             self.big = Some(big);
         }
         Ok(message)
@@ -206,7 +206,7 @@ mod tests {
 
     #[tokio::test]
     async fn messages_of_all_sizes_come_out_whole() {
-        let sizes = [0, 1, 3, BIG - 1, BIG, BIG + 1, 5, MANY * 3, 0, 100];
+        let sizes = [0, 1, 3, BIG - 1, BIG, BIG + 1, 5, LARGE_BUFFER * 3, 0, 100];
         let messages: Vec<Vec<u8>> = sizes.iter().map(|size| vec![*size as u8; *size]).collect();
         let bytes = frame_messages(&messages);
         let whole = all(bytes.as_slice()).await.unwrap();

@@ -15,7 +15,7 @@ const READ_STEP: usize = 8 << 10;
 /// Size up to which bodies are not charged to a budget: the number of connections bounds them.
 pub(super) const SMALL: usize = 64 << 10;
 /// Step in which bigger bodies are charged as they arrive.
-const COUNTED: usize = 256 << 10;
+const CHARGE_STEP: usize = 256 << 10;
 
 /// Error reading a message.
 #[derive(Debug, thiserror::Error)]
@@ -96,7 +96,7 @@ impl HttpReader {
         if size <= SMALL {
             return Ok(());
         }
-        let counted = permit.grow_to(size.next_multiple_of(COUNTED));
+        let counted = permit.grow_to(size.next_multiple_of(CHARGE_STEP));
         counted.map_err(|full| bad(503, full.to_string()))
     }
 

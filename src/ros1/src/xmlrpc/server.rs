@@ -1,7 +1,8 @@
 //! XML-RPC server: one task per connection; requests on a connection are processed in order.
 //!
 //! The memory for big requests and answers is charged to a budget: a request waits for its share before its body is
-//! read, an answer before it is generated, and it is released when the last byte has been written.
+//! read, an answer before it is generated, and it is released when the last byte has been written. Processor time is
+//! charged to the same budget.
 
 use std::io;
 use std::sync::Arc;
@@ -68,8 +69,8 @@ pub async fn serve(listener: TcpListener, handler: Arc<dyn XmlRpcHandler>, limit
     let most = limits.connections;
     let server = Arc::new(XmlRpcServer { handler, limits });
     let connected = |stream| {
-        let server = server.clone();
-        async move { server.serve_connection(stream).await }
+        let (server, budget) = (server.clone(), server.limits.budget.clone());
+        budget.meter(async move { server.serve_connection(stream).await })
     };
     net::serve_connections(listener, most, "XML-RPC", connected).await;
 }

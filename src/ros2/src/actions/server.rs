@@ -2,22 +2,26 @@
 
 mod retired;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use budget::Budget;
 use bytes::Bytes;
+use parking_lot::Mutex;
 use ros_bus::{
-    ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, QosProfile, ServiceHandler, ServiceType, WireType,
+    ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, GoalOutcome, QosProfile, ServiceHandler,
+    ServiceType, WireType,
 };
 use ros_message::schema::ActionDef;
+use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
 use self::retired::{RetiredGuard, release_retired};
 use super::ActionInterfaces;
-use super::goal_server::{self, GoalServer, GoalServerTopics};
+use super::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
 use crate::raw::{self, RawWriter};
 use crate::services;
 use crate::state::{BoxedGuard, Ros2BusState};
@@ -39,6 +43,48 @@ struct ActionServerState {
     name: String,
     handler: Arc<dyn ActionHandler>,
     goals: Arc<GoalServer<Writers>>,
+    /// Goals that have not ended, by id, whose handler defers its answer.
+    deferred: Mutex<HashMap<String, DeferredGoal>>,
+}
+
+/// A goal that its handler accepts or rejects later.
+struct DeferredGoal {
+    begun: PendingGoal,
+    /// Receives the response to its sender; taken once that is known.
+    sender: Option<oneshot::Sender<Bytes>>,
+}
+
+impl ActionServerState {
+    /// Lets a goal wait for its handler's answer; returns the receiver of the response to its sender.
+    fn defer(&self, begun: PendingGoal) -> oneshot::Receiver<Bytes> {
+        let (sender, answered) = oneshot::channel();
+        self.deferred.lock().insert(begun.id(), DeferredGoal { begun, sender: Some(sender) });
+        answered
+    }
+
+    /// Changes a goal that was deferred, and answers its sender unless that was done before.
+    fn answer_deferred(&self, id: &str, change: impl FnOnce(&GoalServer<Writers>, &PendingGoal) -> Bytes) {
+        let mut deferred = self.deferred.lock();
+        let Some(goal) = deferred.get_mut(id) else {
+            return;
+        };
+        let answer = change(&self.goals, &goal.begun);
+        if let Some(sender) = goal.sender.take() {
+            // The goal's sender may be gone.
+            let _ = sender.send(answer);
+        }
+    }
+
+    /// Answers a goal that ends before it was accepted; returns whether it is rejected, and thereby forgotten.
+    fn reject_deferred(&self, id: &str, outcome: GoalOutcome) -> bool {
+        let deferred = self.deferred.lock().remove(id);
+        let Some((begun, sender)) = deferred.and_then(|goal| Some((goal.begun, goal.sender?))) else {
+            return false;
+        };
+        let is_rejected = outcome == GoalOutcome::Rejected;
+        let _ = sender.send(self.goals.answer(&begun, !is_rejected));
+        is_rejected
+    }
 }
 
 struct Writers {
@@ -76,6 +122,7 @@ impl Ros2ActionServer {
             name: name.to_owned(),
             handler,
             goals: GoalServer::new(name, of, writers, Budget::without_limit()),
+            deferred: Mutex::default(),
         });
         let serve = |(service, of): (String, ServiceType), handler: Arc<dyn ServiceHandler>| {
             services::serve(bus, &service, of, handler)
@@ -97,6 +144,10 @@ impl Drop for Ros2ActionServer {
     fn drop(&mut self) {
         self.task.abort();
         let goals = &self.shared.goals;
+        let deferred: Vec<String> = self.shared.deferred.lock().keys().cloned().collect();
+        for id in deferred {
+            self.shared.reject_deferred(&id, GoalOutcome::Rejected);
+        }
         goals.close();
         let asked = goals.are_results_requested();
         if let Some(guard) = self.get_result.take().filter(|_| !asked) {
@@ -111,12 +162,20 @@ impl Drop for Ros2ActionServer {
 }
 
 impl ActionServer for Ros2ActionServer {
+    fn accept_goal(&self, id: &str) {
+        self.shared.answer_deferred(id, |goals, begun| goals.accept(begun));
+    }
+
+    fn execute_goal(&self, id: &str) {
+        self.shared.answer_deferred(id, |goals, begun| goals.answer(begun, true));
+    }
+
     fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
         self.shared.goals.publish_feedback(id, &feedback)
     }
 
     fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
-        self.shared.goals.end_goal(id, &end)
+        self.shared.reject_deferred(id, end.outcome) || self.shared.goals.end_goal(id, &end)
     }
 }
 
@@ -137,10 +196,17 @@ impl ServiceHandler for SendGoal {
                 return Ok(goal_server::rejected_response());
             }
         };
-        let taken = handler.on_goal(&begun.id(), goal);
-        let answer = goals.answer(&begun, taken.is_ok());
-        taken.unwrap_or_else(|reason| refused(reason.into_string()));
-        Ok(answer)
+        // Before the goal is handed over: it may be answered at once.
+        let deferred = handler.is_answer_deferred().then(|| self.0.defer(begun));
+        match (handler.on_goal(&begun.id(), goal), deferred) {
+            (Ok(()), Some(answered)) => Ok(answered.await.unwrap_or_else(|_| goal_server::rejected_response())),
+            (Ok(()), None) => Ok(goals.answer(&begun, true)),
+            (Err(reason), _) => {
+                refused(reason.into_string());
+                self.0.deferred.lock().remove(&begun.id());
+                Ok(goals.answer(&begun, false))
+            }
+        }
     }
 }
 

@@ -33,16 +33,22 @@ enum Heard {
     Cancel(String),
 }
 
-/// Reports its callbacks, and accepts all goals or none.
+/// Reports its callbacks, and accepts all goals or none, or answers later.
 struct Handler {
     heard: mpsc::UnboundedSender<Heard>,
     takes: bool,
+    defers: bool,
 }
 
 impl Handler {
     fn new(takes: bool) -> (Arc<Self>, mpsc::UnboundedReceiver<Heard>) {
         let (heard, hears) = mpsc::unbounded_channel();
-        (Arc::new(Self { heard, takes }), hears)
+        (Arc::new(Self { heard, takes, defers: false }), hears)
+    }
+
+    fn deferring() -> (Arc<Self>, mpsc::UnboundedReceiver<Heard>) {
+        let (heard, hears) = mpsc::unbounded_channel();
+        (Arc::new(Self { heard, takes: true, defers: true }), hears)
     }
 }
 
@@ -51,6 +57,10 @@ impl ActionHandler for Handler {
         let _ = self.heard.send(Heard::Goal(id.to_owned(), goal));
         let taken = self.takes.then_some(());
         taken.ok_or_else(|| FailureReason::new("no"))
+    }
+
+    fn is_answer_deferred(&self) -> bool {
+        self.defers
     }
 
     fn on_cancel(&self, id: &str) {

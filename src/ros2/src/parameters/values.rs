@@ -35,25 +35,46 @@ pub enum TypedValue {
     Strings(Vec<String>),
 }
 
+impl TypedValue {
+    /// Returns the type.
+    pub fn kind(&self) -> ParameterKind {
+        match self {
+            Self::NotSet => ParameterKind::NotSet,
+            Self::Bool(_) => ParameterKind::Bool,
+            Self::Integer(_) => ParameterKind::Integer,
+            Self::Double(_) => ParameterKind::Double,
+            Self::String(_) => ParameterKind::String,
+            Self::Bytes(_) => ParameterKind::Bytes,
+            Self::Bools(_) => ParameterKind::Bools,
+            Self::Integers(_) => ParameterKind::Integers,
+            Self::Doubles(_) => ParameterKind::Doubles,
+            Self::Strings(_) => ParameterKind::Strings,
+        }
+    }
+}
+
+/// The types in the order of their numbers in `rcl_interfaces/msg/ParameterType`.
+const KINDS: [ParameterKind; 10] = [
+    ParameterKind::NotSet,
+    ParameterKind::Bool,
+    ParameterKind::Integer,
+    ParameterKind::Double,
+    ParameterKind::String,
+    ParameterKind::Bytes,
+    ParameterKind::Bools,
+    ParameterKind::Integers,
+    ParameterKind::Doubles,
+    ParameterKind::Strings,
+];
+
 /// Returns the number of a type in `rcl_interfaces/msg/ParameterType`.
 pub fn number_from_kind(kind: ParameterKind) -> u8 {
-    (0..=9).find(|number| kind_from_number(*number) == kind).unwrap_or(0)
+    KINDS.iter().zip(0..).find_map(|(known, number)| (*known == kind).then_some(number)).unwrap_or(0)
 }
 
 /// Returns the type of this number in `rcl_interfaces/msg/ParameterType`; an unknown number counts as not set.
 pub fn kind_from_number(number: u8) -> ParameterKind {
-    match number {
-        1 => ParameterKind::Bool,
-        2 => ParameterKind::Integer,
-        3 => ParameterKind::Double,
-        4 => ParameterKind::String,
-        5 => ParameterKind::Bytes,
-        6 => ParameterKind::Bools,
-        7 => ParameterKind::Integers,
-        8 => ParameterKind::Doubles,
-        9 => ParameterKind::Strings,
-        _ => ParameterKind::NotSet,
-    }
+    KINDS.get(usize::from(number)).copied().unwrap_or_default()
 }
 
 /// Returns true if the value's type may have to be adapted to the parameter's, or is not determined by the value.
@@ -175,19 +196,7 @@ fn is_integer(value: f64) -> bool {
 /// Writes a value.
 pub fn write(value: &TypedValue, put: &mut CdrWriter) {
     use TypedValue::*;
-    let number = match value {
-        NotSet => 0,
-        Bool(_) => 1,
-        Integer(_) => 2,
-        Double(_) => 3,
-        String(_) => 4,
-        Bytes(_) => 5,
-        Bools(_) => 6,
-        Integers(_) => 7,
-        Doubles(_) => 8,
-        Strings(_) => 9,
-    };
-    put.byte(number);
+    put.byte(number_from_kind(value.kind()));
     put.byte(u8::from(*value == Bool(true)));
     let integer = if let Integer(value) = value { *value } else { 0 };
     put.number(integer.to_le_bytes());

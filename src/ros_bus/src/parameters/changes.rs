@@ -68,6 +68,12 @@ impl ParamChangeSender {
         self.0.told.notify_one();
         Ok(())
     }
+
+    /// Returns true if the watcher is gone.
+    pub fn is_closed(&self) -> bool {
+        // There are two ends.
+        Arc::strong_count(&self.0) == 1
+    }
 }
 
 impl Drop for ParamChangeSender {
@@ -136,10 +142,14 @@ mod tests {
             assert_eq!((&*key, value), expected);
         }
         assert!(changes.recv().now_or_never().is_none(), "it is told all");
+        assert!(!teller.is_closed());
         teller.send("/a".into(), None).expect("memory");
         drop(teller);
         assert_eq!(changes.recv().await, Some(("/a".into(), None)));
         assert_eq!(changes.recv().await, None);
+        let (teller, changes) = param_change_channel(&Budget::without_limit());
+        drop(changes);
+        assert!(teller.is_closed());
     }
 
     #[tokio::test]

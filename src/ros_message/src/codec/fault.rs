@@ -3,8 +3,6 @@
 
 use std::fmt;
 
-use crate::schema::MessageType;
-
 /// An error in a conversion, with the field concerned.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CodecError {
@@ -140,7 +138,7 @@ pub enum CodecErrorKind {
 
 /// An error that collects its path while it propagates. Boxed, so that results on the hot path stay one word.
 #[derive(Debug)]
-pub(crate) struct Fault(Box<FaultDetails>);
+pub struct Fault(Box<FaultDetails>);
 
 #[derive(Debug)]
 struct FaultDetails {
@@ -167,20 +165,25 @@ impl Fault {
         matches!(self.0.kind, CodecErrorKind::OutOfRange { .. })
     }
 
+    /// Adds the name or path of a field; an empty one is the message itself.
     #[cold]
-    pub(crate) fn in_field(mut self, name: &str) -> Fault {
-        self.0.place.push(Segment::Field(name.to_owned()));
+    pub fn in_field(mut self, path: &str) -> Fault {
+        if !path.is_empty() {
+            self.0.place.push(Segment::Field(path.to_owned()));
+        }
         self
     }
 
+    /// Adds the position in an array.
     #[cold]
-    pub(crate) fn at_index(mut self, index: usize) -> Fault {
+    pub fn at_index(mut self, index: usize) -> Fault {
         self.0.place.push(Segment::Index(index));
         self
     }
 
+    /// Returns the error for a message of the type of this name.
     #[cold]
-    pub(crate) fn into_codec_error(self, message: &MessageType) -> CodecError {
+    pub fn into_codec_error(self, type_name: &str) -> CodecError {
         let mut path = String::new();
         for segment in self.0.place.iter().rev() {
             match segment {
@@ -192,7 +195,7 @@ impl Fault {
                 Segment::Index(index) => path.push_str(&format!("[{index}]")),
             }
         }
-        CodecError { type_name: message.name().to_owned(), path, kind: self.0.kind }
+        CodecError { type_name: type_name.to_owned(), path, kind: self.0.kind }
     }
 }
 

@@ -334,7 +334,7 @@ impl<'a> Json<'a> {
     /// Reads a representation of NaN or an infinity: `null`, Python's bare words, or the same words as strings.
     #[cold]
     fn non_finite<T: Wire>(&mut self) -> Result<T, Fault> {
-        const WORDS: [(&str, f64); 7] = [
+        const NUMBER_WORDS: [(&str, f64); 7] = [
             ("null", f64::NAN),
             ("NaN", f64::NAN),
             ("Infinity", f64::INFINITY),
@@ -343,7 +343,7 @@ impl<'a> Json<'a> {
             ("\"Infinity\"", f64::INFINITY),
             ("\"-Infinity\"", f64::NEG_INFINITY),
         ];
-        for (word, value) in WORDS {
+        for (word, value) in NUMBER_WORDS {
             if let Some(value) = T::from_non_finite(value) {
                 if self.skip_word(word) {
                     return Ok(value);

@@ -178,14 +178,14 @@ impl Json<'_> {
     /// Writes a time. The ROS versions differ in the names of the parts and in which parts may be negative.
     #[inline]
     fn time(&mut self, scalar: Scalar, bytes: &[u8]) {
-        const OF_ONE: [&[u8]; 2] = [b"{\"secs\":", b",\"nsecs\":"];
+        const ROS1_TIME_KEYS: [&[u8]; 2] = [b"{\"secs\":", b",\"nsecs\":"];
         const OF_TWO: [&[u8]; 2] = [b"{\"sec\":", b",\"nanosec\":"];
         let (secs, nsecs) = bytes.split_at(4);
         let (secs, nsecs) = (array(secs), array(nsecs));
         let (signed, unsigned) = (i32::from_le_bytes, u32::from_le_bytes);
         match scalar {
-            Scalar::Time => self.parts(OF_ONE, unsigned(secs), unsigned(nsecs)),
-            Scalar::Duration => self.parts(OF_ONE, signed(secs), signed(nsecs)),
+            Scalar::Time => self.parts(ROS1_TIME_KEYS, unsigned(secs), unsigned(nsecs)),
+            Scalar::Duration => self.parts(ROS1_TIME_KEYS, signed(secs), signed(nsecs)),
             _ => self.parts(OF_TWO, signed(secs), unsigned(nsecs)),
         }
     }

@@ -104,7 +104,7 @@ impl Default for FillOptions {
     }
 }
 
-/// What the input held that the message cannot.
+/// Content of the input that the message cannot hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct FillReport {
     /// True if a `std_msgs/Header` of a ROS 2 message, at any depth, came with `seq`, which ROS 2 removed from headers:

@@ -36,9 +36,9 @@ pub(crate) struct CodecPlan {
     pub(crate) depth: usize,
     /// True for `std_msgs/Header`.
     pub(crate) header: bool,
-    /// For input: one entry per field.
+    /// Entries for input: one per field.
     pub(crate) members: Members,
-    /// For output: one entry per value after flattening.
+    /// Steps for output: one per value after flattening.
     pub(crate) steps: Vec<PlanStep>,
     /// The literal after the last value.
     pub(crate) tail: Literal,

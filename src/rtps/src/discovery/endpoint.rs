@@ -7,8 +7,8 @@ use super::{EndpointData, policies};
 use crate::wire::{ParameterWriter, WireError, list_header, next_parameter, parameter_list, pid};
 use crate::{EntityId, Guid};
 
-const KNOWN: [u16; 13] = {
-    let [a, b, c, d, e, f, g] = policies::KNOWN;
+const KNOWN_PARAMETERS: [u16; 13] = {
+    let [a, b, c, d, e, f, g] = policies::KNOWN_PARAMETERS;
     [
         pid::ENDPOINT_GUID,
         pid::TOPIC_NAME,
@@ -33,6 +33,16 @@ const LONGEST: usize = 1024;
 impl EndpointData {
     /// Encodes the data as the payload of a sample. Names or user data of more than 65,527 bytes are omitted.
     pub fn to_bytes(&self) -> Bytes {
+        self.encode(None)
+    }
+
+    /// Encodes the data with a number that receivers skip (PID_PAD, 9.4.2.11.2): a server of Fast DDS ignores an
+    /// announcement whose bytes are those of the one before.
+    pub fn to_bytes_again(&self, repetition: u32) -> Bytes {
+        self.encode(Some(repetition))
+    }
+
+    fn encode(&self, repetition: Option<u32>) -> Bytes {
         let mut bytes = list_header();
         let mut list = ParameterWriter::new(&mut bytes);
         list.guid(pid::ENDPOINT_GUID, self.guid);
@@ -50,6 +60,9 @@ impl EndpointData {
         policies::write_qos(&self.qos, &mut list);
         if !self.user_data.is_empty() {
             list.byte_sequence(pid::USER_DATA, &self.user_data);
+        }
+        if let Some(repetition) = repetition {
+            list.u32(pid::PAD, repetition);
         }
         list.end();
         bytes.into()
@@ -70,7 +83,7 @@ impl EndpointData {
             expects_inline_qos: false,
         };
         let mut input = parameter_list(payload)?;
-        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
+        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN_PARAMETERS)? {
             match number {
                 pid::TOPIC_NAME => topic = Some(check_length(number, value.text(number)?)?.to_owned()),
                 pid::TYPE_NAME => type_name = Some(check_length(number, value.text(number)?)?.to_owned()),
@@ -96,7 +109,7 @@ fn check_length<T: AsRef<[u8]> + ?Sized>(number: u16, value: &T) -> Result<&T, W
 fn parse_guid(payload: &Bytes) -> Result<Guid, WireError> {
     let mut input = parameter_list(payload)?;
     let mut guid = None;
-    while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
+    while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN_PARAMETERS)? {
         if number == pid::ENDPOINT_GUID {
             guid = Some(value.guid()?);
         }

@@ -13,11 +13,11 @@ pub fn guid_of_key(data: &Data) -> Option<Guid> {
 }
 
 fn guid_of_payload(payload: &Bytes) -> Option<Guid> {
-    const KNOWN: [u16; 3] = [pid::ENDPOINT_GUID, pid::KEY_HASH, pid::PARTICIPANT_GUID];
+    const GUID_PARAMETERS: [u16; 3] = [pid::ENDPOINT_GUID, pid::KEY_HASH, pid::PARTICIPANT_GUID];
     let mut input = parameter_list(payload).ok()?;
-    let mut guids = [None; KNOWN.len()];
-    while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN).ok()? {
-        let rank = KNOWN.iter().position(|known| *known == number)?;
+    let mut guids = [None; GUID_PARAMETERS.len()];
+    while let Some((number, mut value)) = next_parameter(&mut input, &GUID_PARAMETERS).ok()? {
+        let rank = GUID_PARAMETERS.iter().position(|known| *known == number)?;
         guids[rank] = Some(value.guid().ok()?);
     }
     // Endpoint data also contains the GUID of the participant.

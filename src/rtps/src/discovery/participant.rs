@@ -18,7 +18,7 @@ const BUILTIN: u32 = 0x3f;
 /// Maximum number of locators of one kind that are kept.
 pub(super) const MOST_LOCATORS: usize = 16;
 
-const KNOWN: [u16; 11] = [
+const KNOWN_PARAMETERS: [u16; 11] = [
     pid::PROTOCOL_VERSION,
     pid::VENDOR_ID,
     pid::PARTICIPANT_GUID,
@@ -86,7 +86,7 @@ impl ParticipantData {
             builtin: BUILTIN,
             lease: Some(LEASE),
         };
-        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
+        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN_PARAMETERS)? {
             match number {
                 pid::PARTICIPANT_GUID => guid = Some(value.guid()?),
                 _ => data.set_parameter(number, value)?,

@@ -12,7 +12,7 @@ const MAX_BLOCKING: Duration = Duration::from_millis(100);
 const MOST_REPRESENTATIONS: u32 = 8;
 
 /// Parameters that [`set_parameter`] handles.
-pub(super) const KNOWN: [u16; 7] = [
+pub(super) const KNOWN_PARAMETERS: [u16; 7] = [
     pid::RELIABILITY,
     pid::DURABILITY,
     pid::HISTORY,

@@ -34,7 +34,7 @@ impl NetworkNamespace for HostNamespace {
 
 const HOUR: Duration = Duration::from_secs(3600);
 /// Only limits the duration of a failing test.
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Returns a domain that no other test of this process uses; those of `tests/loopback.rs` are higher.
 fn domain() -> u16 {
@@ -56,7 +56,7 @@ async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
     for _ in 0..sent {
         receiver.recv(&mut [0; 512]).expect("a datagram");
     }
-    timeout(LONG, room).await.expect("in time");
+    timeout(PATIENCE, room).await.expect("in time");
     sender.send(&[0; 512]).expect("there is room");
 }
 
@@ -73,7 +73,7 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
     let mut discovered = here.watch_discovered();
     let known = discovered.wait_for(|all| all.participants.contains_key(&prefix));
     let at = {
-        let known = timeout(LONG, known).await.expect("in time");
+        let known = timeout(PATIENCE, known).await.expect("in time");
         let known = known.expect("it runs");
         known.participants[&prefix].discovery[0].udp_address().expect("an address")
     };
@@ -85,7 +85,7 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
-    timeout(LONG, closed).await.expect("its port is free");
+    timeout(PATIENCE, closed).await.expect("its port is free");
     let there = || here.watch_discovered().borrow().participants.contains_key(&prefix);
     assert!(there(), "nobody has looked");
     here.check_ports();
@@ -100,7 +100,7 @@ async fn other_tasks_get_their_turns_while_a_socket_fills_as_fast_as_it_is_read(
     let to = {
         let mut discovered = other.watch_discovered();
         let known = discovered.wait_for(|all| all.participants.contains_key(&prefix));
-        let known = timeout(LONG, known).await.expect("in time");
+        let known = timeout(PATIENCE, known).await.expect("in time");
         known.expect("it runs").participants[&prefix].user[0].udp_address().expect("an address")
     };
     let is_served = Arc::new(AtomicBool::new(false));
@@ -109,7 +109,7 @@ async fn other_tasks_get_their_turns_while_a_socket_fills_as_fast_as_it_is_read(
         let is_served = Arc::clone(&is_served);
         std::thread::spawn(move || {
             let socket = std::net::UdpSocket::bind("127.0.0.1:0").expect("a socket");
-            let deadline = Instant::now() + LONG;
+            let deadline = Instant::now() + PATIENCE;
             while !is_served.load(Ordering::Relaxed) && Instant::now() < deadline {
                 let _ = socket.send_to(&[0; 60_000], to);
             }
@@ -125,5 +125,5 @@ async fn other_tasks_get_their_turns_while_a_socket_fills_as_fast_as_it_is_read(
     for sender in senders {
         sender.join().expect("it sends");
     }
-    assert!(took < LONG / 2, "{TURNS} turns took {took:?}");
+    assert!(took < PATIENCE / 2, "{TURNS} turns took {took:?}");
 }

@@ -73,6 +73,7 @@ impl Engine {
             self.predecessors.remove_expired(now);
             self.announce();
             self.ping_silent(now);
+            self.repeat_unconfirmed(now);
             self.announce_at = now + self.announce_pause;
             self.announce_pause = (self.announce_pause * 2).min(self.longest_pause());
         }

@@ -46,9 +46,9 @@ impl WriterQueue {
 pub(super) enum SendReadiness {
     /// A datagram of about this length is ready; whether a reader has requested it again.
     Length(usize, bool),
-    /// Nothing may be sent until a reader acknowledges something.
+    /// The path is blocked until a reader acknowledges something.
     Held,
-    /// Nothing is queued.
+    /// The queue is empty.
     Empty,
 }
 

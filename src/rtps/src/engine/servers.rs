@@ -19,12 +19,14 @@
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr, SocketAddrV4};
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::discovering::{ANNOUNCERS, DISPOSED, LAST_PAUSE, PARTICIPANTS};
 use super::{Datagram, Engine};
-use crate::discovery::{self, ParticipantData};
+use crate::discovery::{self, EndpointData, ParticipantData};
 use crate::locator::Locator;
 use crate::sequence::SequenceSet;
 use crate::shared::{DiscoveryServer, ReceivedSample};
@@ -39,10 +41,24 @@ const MISSING: Duration = Duration::from_millis(450);
 /// report the participant gone, because it announces the participant again when it comes back.
 pub(super) const SPARE: Duration = Duration::from_secs(5);
 
+/// Time for the other side of a match to confirm it before the local endpoint is announced to the servers again, and
+/// the longest pause between two such announcements.
+const UNCONFIRMED: Duration = Duration::from_secs(1);
+const MAX_UNCONFIRMED: Duration = Duration::from_secs(64);
+
 /// Properties announced to servers.
 const PROPERTIES: [(&str, &str); 2] = [("PARTICIPANT_TYPE", "SUPER_CLIENT"), ("DS_VERSION", "2.0")];
 
-/// How another participant was discovered.
+/// Announcements of a local endpoint whose match is not confirmed.
+#[derive(Debug)]
+pub(super) struct Repetition {
+    /// Number of times that it was announced again.
+    times: u32,
+    /// Time of the next one.
+    at: Instant,
+}
+
+/// Source of the discovery of another participant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum DiscoverySource {
     /// By its own announcement; contains the source address of the last one.
@@ -171,6 +187,41 @@ impl Engine {
             self.enqueue(entity, wanted);
             if let Some(remote) = self.remotes.get_mut(&prefix) {
                 remote.asked.get_or_insert(now);
+            }
+        }
+    }
+
+    /// Announces local endpoints to the servers again while a participant known from them does not confirm a match: a
+    /// server of Fast DDS 2.14 loses an announcement that it handles together with the disposal of another endpoint
+    /// (seen on the wire: acknowledged, and forwarded to nobody), and forwards a new one.
+    pub(super) fn repeat_unconfirmed(&mut self, now: Instant) {
+        if !self.is_client() {
+            return;
+        }
+        let remotes = &self.remotes;
+        let is_unconfirmed = |(end, confirmed): (&Arc<EndpointData>, bool)| {
+            let remote = remotes.get(&end.guid.prefix);
+            !confirmed && remote.is_some_and(|remote| remote.via == DiscoverySource::Servers)
+        };
+        let writers = self.writers.iter().map(|(entity, it)| (*entity, it.state.readers().any(is_unconfirmed)));
+        let readers = self.readers.iter().map(|(entity, it)| (*entity, it.state.writers().any(is_unconfirmed)));
+        let unconfirmed: BTreeSet<EntityId> =
+            writers.chain(readers).filter_map(|(entity, any)| any.then_some(entity)).collect();
+        self.repetitions.retain(|entity, _| unconfirmed.contains(entity));
+        for entity in unconfirmed {
+            let first = Repetition { times: 0, at: now + UNCONFIRMED };
+            let repetition = self.repetitions.entry(entity).or_insert(first);
+            if repetition.at > now {
+                continue;
+            }
+            repetition.times += 1;
+            let pause = UNCONFIRMED * 2_u32.saturating_pow(repetition.times.min(8));
+            repetition.at = now + pause.min(MAX_UNCONFIRMED);
+            let times = repetition.times;
+            let writer = self.writers.get(&entity).map(|it| &it.state.own);
+            let own = writer.or_else(|| self.readers.get(&entity).map(|it| &it.state.own));
+            if let Some(again) = own.map(|own| own.to_bytes_again(times)) {
+                self.publish_announcement(now, entity, again);
             }
         }
     }

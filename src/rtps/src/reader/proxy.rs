@@ -1,4 +1,4 @@
-//! What was received from one writer, and what is missing of it.
+//! Samples received from one writer, and those that are missing.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -22,7 +22,7 @@ const SELDOM_ASK: Duration = Duration::from_secs(2);
 /// Interval between resend requests for the same sample.
 pub(super) const ASK_AGAIN: Duration = Duration::from_millis(20);
 /// Maximum number of samples that a writer is said to keep for late readers.
-const MOST_KEPT: i64 = 256;
+const MAX_HISTORY: i64 = 256;
 /// Overhead of a kept sample in bytes, which matters for many small ones.
 pub(super) const KEEPING: usize = 256;
 
@@ -62,7 +62,7 @@ impl WriterProxy {
         if self.data.qos.durability < DurabilityKind::TransientLocal {
             return false;
         }
-        let kept = (beat.last.0 - beat.first.0 + 1).clamp(0, MOST_KEPT);
+        let kept = (beat.last.0 - beat.first.0 + 1).clamp(0, MAX_HISTORY);
         let kept = usize::try_from(kept).ok();
         std::mem::replace(&mut self.kept, kept) != kept
     }

@@ -7,7 +7,7 @@ use crate::time::{WireDuration, WireTime};
 use crate::{EntityId, Guid, GuidPrefix, SampleIdentity, SequenceNumber};
 
 /// Upper limit of sequence numbers, which no writer reaches: 146 years at a billion samples per second.
-const MOST: i64 = 1 << 62;
+const MAX_SEQUENCE_NUMBER: i64 = 1 << 62;
 
 /// A cursor over a part of received bytes.
 #[derive(Debug, Clone)]
@@ -108,7 +108,7 @@ impl<'a> WireReader<'a> {
     /// Reads a sequence number of at least `least` that is low enough for additions not to overflow.
     pub fn number_at_least(&mut self, least: i64) -> Result<SequenceNumber, WireError> {
         let number = self.number()?;
-        if (least..MOST).contains(&number.0) { Ok(number) } else { Err(WireError::Number(number.0)) }
+        if (least..MAX_SEQUENCE_NUMBER).contains(&number.0) { Ok(number) } else { Err(WireError::Number(number.0)) }
     }
 
     /// Reads the sequence number of a sample.

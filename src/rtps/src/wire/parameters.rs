@@ -11,6 +11,7 @@ use crate::{Guid, SampleIdentity};
 
 /// Parameter ids (9.6.3.2, 9.6.4), without the bit [`pid::MUST_BE_UNDERSTOOD`].
 pub(crate) mod pid {
+    pub const PAD: u16 = 0x0000;
     pub const SENTINEL: u16 = 0x0001;
     pub const PARTICIPANT_LEASE_DURATION: u16 = 0x0002;
     pub const TOPIC_NAME: u16 = 0x0005;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Interest};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Interest};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
@@ -19,7 +19,13 @@ use crate::protocol::{self, Command, NodeStatus, ShimMessage, ShimRequest, Snaps
 const EVENTS: usize = 256;
 /// Maximum number of requests not yet answered by a shim: few enough to fit into the socket's buffer, so that no caller
 /// that gives up waiting leaves a partly written one.
-const UNANSWERED: usize = 64;
+const MAX_UNANSWERED: usize = 64;
+
+/// Maximum length of a shim's message in bytes, far above what thousands of nodes take: nodes may have taken a shim
+/// over, and its messages count in no budget.
+const LONGEST_MESSAGE: u64 = 4 << 20;
+/// Bytes of a message that is not understood that are logged.
+const MAX_LOGGED: usize = 200;
 
 /// State of a servant as reported by its shim.
 #[derive(Debug)]
@@ -62,13 +68,16 @@ impl Default for ServantView {
 }
 
 impl ServantView {
-    /// Applies the shim's messages until the connection ends.
+    /// Applies the shim's messages until the connection ends, or a message is too long.
     pub(super) async fn read_messages(&self, read: OwnedReadHalf) {
-        let mut lines = BufReader::new(read).lines();
-        while let Ok(Some(line)) = lines.next_line().await {
-            match serde_json::from_str(&line) {
+        let mut reader = BufReader::new(read);
+        while let Some(line) = read_message(&mut reader).await {
+            match serde_json::from_slice(&line) {
                 Ok(message) => self.apply_message(message),
-                Err(error) => tracing::warn!(%error, line, "a shim sent something unknown"),
+                Err(error) => {
+                    let begin = String::from_utf8_lossy(&line[..line.len().min(MAX_LOGGED)]);
+                    tracing::warn!(%error, %begin, "a shim sent something unknown");
+                }
             }
         }
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -137,7 +146,7 @@ impl ServantView {
         if waiting.closed {
             return Err(ShimRequestError::Gone);
         }
-        if waiting.answers.len() >= UNANSWERED {
+        if waiting.answers.len() >= MAX_UNANSWERED {
             return Err(ShimRequestError::Silent);
         }
         let id = waiting.next;
@@ -218,6 +227,17 @@ impl RequestSender {
     }
 }
 
+/// Reads one line; `None` at the end of the connection, and if it is too long.
+async fn read_message(reader: &mut BufReader<OwnedReadHalf>) -> Option<Vec<u8>> {
+    let mut line = Vec::new();
+    reader.take(LONGEST_MESSAGE).read_until(b'\n', &mut line).await.ok()?;
+    if line.len() as u64 == LONGEST_MESSAGE {
+        tracing::warn!("a shim sent a message of more than {LONGEST_MESSAGE} bytes; it is heard no longer");
+        return None;
+    }
+    (!line.is_empty()).then_some(line)
+}
+
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
@@ -238,14 +258,14 @@ mod tests {
         let listening = Arc::clone(&known);
         let listener = tokio::spawn(async move { listening.read_messages(read).await });
         let mut asks = JoinSet::new();
-        for _ in 0..UNANSWERED {
+        for _ in 0..MAX_UNANSWERED {
             let (requests, known) = (Arc::clone(&requests), Arc::clone(&known));
             asks.spawn(async move { requests.request(&known, signal()).await });
         }
         let (from_daemon, mut to_daemon) = shim.into_split();
         let mut lines = BufReader::new(from_daemon).lines();
         let mut ids = Vec::new();
-        for _ in 0..UNANSWERED {
+        for _ in 0..MAX_UNANSWERED {
             let line = lines.next_line().await.expect("read").expect("a line");
             let request: ShimRequest = serde_json::from_str(&line).expect("it is whole");
             ids.push(request.id);
@@ -262,5 +282,28 @@ mod tests {
         let asked = requests.request_with_timeout(&known, signal(), Duration::ZERO).await;
         assert!(matches!(asked, Err(ShimRequestError::Silent)), "{asked:?}");
         listener.abort();
+    }
+
+    #[tokio::test]
+    async fn a_shim_that_never_ends_a_message_is_heard_no_longer() {
+        let (daemon, mut shim) = UnixStream::pair().expect("a socket");
+        // Without this, what is not read would wait in the socket.
+        let (read, requests) = RequestSender::split(daemon);
+        drop(requests);
+        let known = Arc::new(ServantView::default());
+        let listening = Arc::clone(&known);
+        let listener = tokio::spawn(async move { listening.read_messages(read).await });
+        let answer = protocol::to_line(&ShimMessage::State { state: ContainerState::Running.into() });
+        shim.write_all(&answer).await.expect("sent");
+        let mut state = known.state.subscribe();
+        state.wait_for(|state| *state == ContainerState::Running).await.expect("it is heard");
+        let block = vec![b' '; 1 << 20];
+        let mut sent = 0;
+        while shim.write_all(&block).await.is_ok() {
+            sent += block.len() as u64;
+            assert!(sent <= 2 * LONGEST_MESSAGE, "it is heard without end");
+        }
+        listener.await.expect("it has ended");
+        assert!(*known.closed.borrow());
     }
 }

@@ -19,7 +19,7 @@ use tokio::task::JoinHandle;
 use tracing::Instrument;
 
 use super::connection::{RequestSender, ServantView, ShimRequestError};
-use super::{kept, sweep};
+use super::{ended_logs, sweep};
 use crate::Error;
 use crate::cgroup::Cgroup;
 use crate::engine::{ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage};
@@ -37,6 +37,8 @@ use crate::sys;
 const FINISH: Duration = Duration::from_secs(20);
 /// Time for a running shim to answer.
 const ANSWER: Duration = Duration::from_secs(10);
+/// Time for which an adoption waits for the state of a servant; a shim that needs longer tells it later.
+const PROMPTLY: Duration = Duration::from_secs(1);
 
 /// A servant of the local engine. Dropping it leaves the servant running.
 #[derive(Debug)]
@@ -113,7 +115,8 @@ pub(super) async fn wait_until_running(
     }
 }
 
-/// Connects to the shim of an earlier daemon.
+/// Connects to the shim of an earlier daemon. The servant is in state `Creating` until its shim answers, which may be
+/// later.
 pub(super) async fn adopt(
     place: ServantLocation<'_>,
     runtime: &RuntimeRecord,
@@ -140,8 +143,10 @@ pub(super) async fn adopt(
             _ = closed.wait_for(|closed| *closed) => Err(silent()),
         }
     };
-    tokio::time::timeout(ANSWER, answered).await.map_err(|_| silent())??;
-    Ok(servant)
+    match tokio::time::timeout(PROMPTLY, answered).await {
+        Ok(Err(closed)) => Err(closed),
+        Ok(Ok(())) | Err(_) => Ok(servant),
+    }
 }
 
 fn connect(
@@ -479,7 +484,7 @@ impl ServantHandle for LocalServant {
 
     async fn keep_log(&self, about: KeptLog) -> Result<KeptLog, Error> {
         self.end().await;
-        kept::keep_log(&self.kept_logs, &self.directory, about).await
+        ended_logs::keep_log(&self.kept_logs, &self.directory, about).await
     }
 
     async fn stop(&self) -> Result<(), Error> {

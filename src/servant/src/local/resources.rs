@@ -1,4 +1,4 @@
-//! What the local engine needs from others: images and hosts.
+//! Resources that others provide to the local engine: images and hosts.
 
 use std::error::Error as StdError;
 use std::net::IpAddr;

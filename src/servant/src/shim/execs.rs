@@ -14,7 +14,7 @@ use tokio::sync::mpsc;
 use super::input::ShimEvent;
 
 /// Maximum number of sessions of a servant.
-const MOST: usize = 16;
+const MAX_SESSIONS: usize = 16;
 
 /// A running session.
 #[derive(Debug)]
@@ -36,7 +36,7 @@ pub(super) struct ExecTable {
 /// Reason why a session cannot be added.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ExecTableError {
-    #[error("{MOST} programs run beside its nodes already, which is the limit: end one first")]
+    #[error("{MAX_SESSIONS} programs run beside its nodes already, which is the limit: end one first")]
     Full,
     #[error("its streams did not arrive")]
     NoStreams,
@@ -51,7 +51,7 @@ impl ExecTable {
 
     /// Adds a session that is being started.
     pub(super) fn add(&mut self, number: u32, socket: OwnedFd) -> Result<(), ExecTableError> {
-        if self.starting.len() + self.running.len() >= MOST {
+        if self.starting.len() + self.running.len() >= MAX_SESSIONS {
             return Err(ExecTableError::Full);
         }
         let socket = StdStream::from(socket);
@@ -156,13 +156,13 @@ mod tests {
     async fn there_are_no_more_than_so_many() {
         let mut execs = ExecTable::new(mpsc::unbounded_channel().0);
         let add = |execs: &mut ExecTable, number| execs.add(number, StdStream::pair().unwrap().1.into());
-        for number in 0..MOST as u32 {
+        for number in 0..MAX_SESSIONS as u32 {
             add(&mut execs, number).unwrap();
         }
         let refused = add(&mut execs, 99).unwrap_err().to_string();
         assert!(refused.contains("the limit"), "{refused}");
         assert!(execs.remove_starting(3) && !execs.remove_starting(3));
         add(&mut execs, 99).unwrap();
-        assert_eq!(execs.clear().len(), MOST);
+        assert_eq!(execs.clear().len(), MAX_SESSIONS);
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nix::sys::signal::Signal;
 use servant::engine::{ContainerState, Engine, LogStart, ServantHandle};
 
 use crate::support::*;
@@ -38,6 +39,29 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let third = world.adopt_single(&world.restart_engine()).await;
     assert_eq!(with_timeout(third.wait_node("/goes")).await.unwrap().signal, Some(libc::SIGTERM));
     world.stop(third).await;
+}
+
+#[tokio::test]
+async fn a_shim_that_does_not_answer_delays_the_adoption_of_no_other_servant() {
+    let world = World::new();
+    let stuck = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    let sound = world.start(spec(vec![node("/a", &["sleep"])])).await;
+    let ids = [stuck.id().to_owned(), sound.id().to_owned()];
+    let shim = world.runtime(&ids[0]).shim.open_pidfd().unwrap().expect("it runs");
+    send_signal(&shim, Signal::SIGSTOP);
+    drop((stuck, sound));
+    let engine = world.restart_engine();
+    let adopted = with_timeout(engine.adopt()).await.unwrap();
+    let [stuck, sound] = ids.map(|id| engine.servant(&id).expect("it is adopted"));
+    wait_until_told(&*sound).await;
+    assert_eq!((adopted.running.len(), adopted.ended.len()), (2, 0));
+    assert_eq!(*stuck.state().borrow(), ContainerState::Creating);
+    // It tells its state as soon as it can.
+    send_signal(&shim, Signal::SIGCONT);
+    wait_until_told(&*stuck).await;
+    assert_eq!(stuck.nodes(), ["/a"]);
+    world.stop(stuck).await;
+    world.stop(sound).await;
 }
 
 #[tokio::test]

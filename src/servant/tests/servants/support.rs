@@ -164,6 +164,7 @@ impl World {
         let mut adopted = with_timeout(engine.adopt()).await.unwrap();
         let servant = adopted.running.pop().expect("one");
         assert!(adopted.running.is_empty() && adopted.failures.is_empty());
+        wait_until_told(&*servant).await;
         engine.servant(servant.id()).expect("it is held")
     }
 
@@ -233,13 +234,24 @@ fn assert_ended(pid: i32, id: &str) {
     assert!(ended == 1, "process {pid} is left");
 }
 
-/// Kills a process and waits for its end.
-pub fn kill(pidfd: &std::os::fd::OwnedFd) {
+/// Waits until the shim of an adopted servant has told its state.
+pub async fn wait_until_told(servant: &dyn ServantHandle) {
+    let mut state = servant.state();
+    with_timeout(state.wait_for(|state| *state != ContainerState::Creating)).await.expect("it is known");
+}
+
+/// Sends a signal to a process.
+pub fn send_signal(pidfd: &std::os::fd::OwnedFd, signal: Signal) {
     use std::os::fd::AsRawFd;
     // SAFETY: a null siginfo is allowed.
     unsafe {
-        libc::syscall(libc::SYS_pidfd_send_signal, pidfd.as_raw_fd(), Signal::SIGKILL as i32, 0_usize, 0);
+        libc::syscall(libc::SYS_pidfd_send_signal, pidfd.as_raw_fd(), signal as i32, 0_usize, 0);
     }
+}
+
+/// Kills a process and waits for its end.
+pub fn kill(pidfd: &std::os::fd::OwnedFd) {
+    send_signal(pidfd, Signal::SIGKILL);
     let mut watched = [nix::poll::PollFd::new(pidfd.as_fd(), nix::poll::PollFlags::POLLIN)];
     let _ = nix::poll::poll(&mut watched, 5000_u16);
 }

@@ -1,4 +1,5 @@
-//! Actions of the servant for robots of the other ROS.
+//! Actions across ROSes: those of the servant for robots of the other ROS, and those of such robots for the servant
+//! ([`lent`]).
 //!
 //! An action consists of five topics in ROS 1, and of three services and two topics in ROS 2. So its parts are not
 //! carried one by one: to the robot a server of its own ROS seems to be there, behind which a client of the servant's
@@ -40,11 +41,10 @@
 //! Whether a newer goal preempts an older one is the server's own policy in both: a `SimpleActionServer` does it, and
 //! the older goal is CANCELED in ROS 2; a server of ROS 2 that cancels or aborts the older goal has it PREEMPTED or
 //! ABORTED in ROS 1. A cancel of all goals concerns those that were sent through this bus.
-//!
-//! Not carried: actions that a robot's node serves for clients in the servant.
 
 mod client;
 mod graph;
+mod lent;
 mod server;
 #[cfg(test)]
 mod tests;
@@ -64,25 +64,31 @@ use ros::ros1::actions::goal_topics::GoalTopics;
 use ros::ros2::actions::goal_server;
 use ros::ros2::actions::goal_services::{GoalNotices, GoalServices};
 use ros::schema::ActionDef;
+use tokio_util::task::AbortOnDropHandle;
+use tracing::Instrument;
 
 use self::client::TranslatedActionClient;
 pub(super) use self::graph::add_actions;
+use self::lent::LentActions;
 use self::server::TranslatedActionServer;
 use super::state::{Translation, not_translated};
 use crate::ActionTwin;
 
 /// Maximum number of actions of a servant that a robot uses at a time.
-const MOST: usize = 256;
+const MAX_ACTIONS: usize = 256;
 
 /// Name of the budget for goals that are under way and results that are kept, in errors.
 const GOALS: &str = "the goals and results of actions";
 
-/// The actions of a servant that its robot uses by their topics and services.
+/// The actions of a servant that its robot uses by their topics and services, and those of the robot.
 pub(super) struct ActionEnds {
     translation: Arc<Translation>,
     /// Budget for the goals that are under way and the results that are kept.
     budget: Budget,
     fronts: Mutex<HashMap<String, KnownFront>>,
+    lent: Arc<LentActions>,
+    /// Keeps the actions of the robot up to date.
+    _following: AbortOnDropHandle<()>,
 }
 
 /// An action in use.
@@ -92,7 +98,7 @@ struct KnownFront {
     front: ActionFront,
 }
 
-/// What looks like a server to the robot.
+/// Stand-in for a server, as the robot sees it.
 #[derive(Clone)]
 pub(super) enum ActionFront {
     One(Arc<GoalTopics<TranslatedActionClient>>),
@@ -103,7 +109,20 @@ impl ActionEnds {
     pub(super) fn new(translation: &Arc<Translation>, budget: &Budget) -> Self {
         // Results that are kept must not take the room of what is on its way.
         let budget = budget.child(GOALS, budget.max_permit() / 2);
-        Self { translation: Arc::clone(translation), budget, fronts: Mutex::default() }
+        let lent = LentActions::new(translation, &budget);
+        let following = tokio::spawn(budget.meter(Arc::clone(&lent).follow_graph()).in_current_span());
+        Self {
+            translation: Arc::clone(translation),
+            budget,
+            fronts: Mutex::default(),
+            lent,
+            _following: AbortOnDropHandle::new(following),
+        }
+    }
+
+    /// Returns the actions of the robot.
+    pub(super) fn lent_actions(&self) -> &LentActions {
+        &self.lent
     }
 
     /// Returns the action that a topic of the robot's ROS is part of, and the part; `None` if no node of the servant
@@ -143,7 +162,7 @@ impl ActionEnds {
         if let Some(other) = fronts.insert(action.to_owned(), known) {
             other.front.cancel_all();
         }
-        if fronts.len() > MOST {
+        if fronts.len() > MAX_ACTIONS {
             fronts.retain(|name, known| name == action || known.front.has_goals() || graph.serves_action(name));
         }
         Ok(Some((end, front)))
@@ -154,7 +173,7 @@ impl ActionEnds {
         let twin = translation.twins.action(type_name);
         let twin = twin.map_err(|reason| not_translated(format!("action {action}"), reason))?;
         let names = (action, server);
-        let client = TranslatedActionClient::open(translation, action, &twin)?;
+        let client = TranslatedActionClient::open(translation, action, &twin, &self.budget)?;
         Ok(match translation.version {
             RosVersion::One => ActionFront::One(GoalTopics::new(names, &twin.twin, client, &self.budget)?),
             RosVersion::Two => {
@@ -168,7 +187,7 @@ impl ActionEnds {
     /// Creates a client with the robot's type of an action that a node of the servant serves.
     pub(super) fn client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         let twin = self.find_type(action, of)?;
-        Ok(Box::new(TranslatedActionClient::open(&self.translation, action, &twin)?))
+        Ok(Box::new(TranslatedActionClient::open(&self.translation, action, &twin, &self.budget)?))
     }
 
     /// Serves an action to the servant's nodes; the handler has the robot's type.
@@ -190,6 +209,7 @@ impl ActionEnds {
     /// Cancels all goals, because the robot has gone.
     pub(super) fn cancel_all(&self) {
         self.fronts.lock().values().for_each(|known| known.front.cancel_all());
+        self.lent.clear();
     }
 }
 

@@ -1,10 +1,10 @@
 //! A servant's graph in the terms of the robot's ROS.
 //!
 //! * For a robot of ROS 1 a process of ROS 2 is one node, the one that the robot has started; what belongs to ROS 2
-//!   itself (parameter services and events) is not shown.
+//!   itself (parameter services and events) is not shown. Nodes that have parameters have dynamic_reconfigure.
 //! * For a robot of ROS 2 each endpoint announces its type and quality of service. In ROS 1 only the node itself knows
 //!   the type of a service and whether a topic is latched, so it is asked, and shown once it has answered. Each node
-//!   has the services about parameters that nodes of ROS 2 have.
+//!   has the services about parameters, and publishes the events, that nodes of ROS 2 have.
 //!
 //! Actions consist of other parts in each ROS; `actions` adds them.
 
@@ -18,14 +18,12 @@ use ros::ros2::names;
 use tokio::sync::watch;
 
 use super::actions::add_actions;
-use super::parameters::ParameterServices;
+use super::parameters::{ParameterServices, event_topic, reconfigurable};
 use super::state::{LeftOut, TranslatedGraph, Translation};
 use super::twins::{KnownTwins, Untranslatable};
 
 /// Packages of ROS 2 whose services every node provides.
 const OF_ROS_2: [&str; 2] = ["rcl_interfaces/", "type_description_interfaces/"];
-/// Topic of ROS 2 with the changes of every node's parameters.
-const PARAMETER_EVENTS: &str = "/parameter_events";
 /// Package of ROS 1 whose services every node provides.
 const OF_ROS_1: &str = "roscpp/";
 /// Type of the services by which nodes of ROS 1 change parameters: robots of ROS 2 use the services about parameters.
@@ -103,7 +101,7 @@ pub(super) fn for_ros1(inner: &Graph, own: &str, twins: &KnownTwins) -> Translat
         owners.into_iter().collect::<Vec<_>>()
     };
     for (topic, ends) in &inner.topics {
-        if topic == PARAMETER_EVENTS {
+        if topic == event_topic::TOPIC {
             continue;
         }
         let translated = TopicNodes {
@@ -136,6 +134,7 @@ pub(super) fn for_ros1(inner: &Graph, own: &str, twins: &KnownTwins) -> Translat
             Some(Ok(_)) | None => drop(out.graph.services.insert(service.clone(), owner(server))),
         }
     }
+    reconfigurable::add_to_graph(inner, own, &mut out.graph);
     add_actions(RosVersion::One, inner, own, twins, &mut out);
     let sought = inner.sought.iter().filter(|(service, _)| !hidden_names::is_hidden(service));
     out.graph.sought = sought.map(|(service, nodes)| (service.clone(), owners(nodes))).collect();
@@ -233,7 +232,7 @@ pub(super) fn for_ros2(
             Err(reason) => out.leave_out(format!("service {service}"), [&**server].into_iter(), &reason),
         }
     }
-    for node in inner.nodes.keys().filter(|node| *node != own && names::is_global(node)) {
+    for node in inner.nodes.keys().filter(|node| event_topic::is_shown(node, own)) {
         // The definitions are built in.
         let all = ParameterServices::of_node(node).unwrap_or_default();
         out.graph.services.extend(all.keys().map(|service| (service.clone(), node.clone())));
@@ -247,6 +246,7 @@ pub(super) fn for_ros2(
         .collect();
     out.graph.nodes = inner.nodes.clone();
     out.graph.ends = ends;
+    event_topic::add_to_graph(own, &mut out.graph);
     add_actions(RosVersion::Two, inner, own, twins, &mut out);
     out
 }

@@ -1,4 +1,4 @@
-//! What is lost on the way between two ROSes: messages that cannot be carried, and values that the other ROS cannot
+//! Losses between the two ROS versions: messages that cannot be carried, and values that the other version cannot
 //! represent. Both are counted, and the first of each is reported.
 
 use std::collections::{BTreeMap, HashMap};
@@ -13,7 +13,7 @@ use crate::MessageTranslator;
 use crate::TranslationError;
 
 /// Maximum number of topics and services that are counted; a robot can name any number.
-const MOST: usize = 1000;
+const MAX_NAMES: usize = 1000;
 
 /// Time after which another failure of a service is reported. A caller may repeat its call as fast as it fails.
 const AGAIN: Duration = Duration::from_secs(1);
@@ -25,7 +25,7 @@ pub trait TranslationObserver: Send + Sync + 'static {
     fn on_loss(&self, name: &str, text: &str);
 }
 
-/// What was lost of one topic or service so far.
+/// Losses of one topic or service so far.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TranslationLosses {
     /// Name of the topic or service.
@@ -56,9 +56,9 @@ impl LossCounters {
         by: &MessageTranslator,
         message: &[u8],
     ) -> Result<Bytes, TranslationError> {
-        let before = by.saturated();
+        let before = by.saturated_count();
         let translated = by.translate(message);
-        let replaced = by.saturated().saturating_sub(before);
+        let replaced = by.saturated_count().saturating_sub(before);
         if replaced > 0 && self.count(name, |counts| &mut counts.saturated, replaced) {
             let text = format!(
                 "{name}: values that the other ROS cannot represent are replaced by the nearest ones, such as times \
@@ -93,17 +93,24 @@ impl LossCounters {
         self.observer.on_loss(service, &text);
     }
 
+    /// Reports what a service has refused where its response has no place for it, unless that was done a moment ago.
+    pub(super) fn report_refusal(&self, service: &str, text: &str) {
+        if self.is_due(service) {
+            self.observer.on_loss(service, text);
+        }
+    }
+
     /// Returns whether a failure of this service is to be reported now, which counts as done.
     fn is_due(&self, service: &str) -> bool {
         let mut failed = self.failed.lock();
         if failed.get(service).is_some_and(|before| before.elapsed() < AGAIN) {
             return false;
         }
-        if failed.len() >= MOST {
+        if failed.len() >= MAX_NAMES {
             failed.retain(|_, before| before.elapsed() < AGAIN);
         }
         // A flood of names is not reported further.
-        let has_room = failed.len() < MOST;
+        let has_room = failed.len() < MAX_NAMES;
         if has_room {
             failed.insert(service.to_owned(), Instant::now());
         }
@@ -118,7 +125,7 @@ impl LossCounters {
     /// Adds to a counter; returns whether that was the first loss of its kind.
     fn count(&self, name: &str, of: impl Fn(&mut TranslationLosses) -> &mut u64, more: u64) -> bool {
         let mut counts = self.counts.lock();
-        if counts.len() >= MOST && !counts.contains_key(name) {
+        if counts.len() >= MAX_NAMES && !counts.contains_key(name) {
             return false;
         }
         let known = counts.entry(name.to_owned());
@@ -160,8 +167,8 @@ mod tests {
             tokio::time::advance(AGAIN).await;
         }
         assert_eq!(recorded.0.lock().len(), 6);
-        (0..2 * MOST).for_each(|number| losses.report_failed_call(&format!("/{number}"), "it is busy"));
-        assert!(recorded.0.lock().len() <= 6 + MOST && losses.failed.lock().len() <= MOST);
+        (0..2 * MAX_NAMES).for_each(|number| losses.report_failed_call(&format!("/{number}"), "it is busy"));
+        assert!(recorded.0.lock().len() <= 6 + MAX_NAMES && losses.failed.lock().len() <= MAX_NAMES);
     }
 
     #[test]
@@ -174,10 +181,10 @@ mod tests {
         assert_eq!(losses.all()[0].untranslated, 3);
         let reported = recorded.0.lock().clone();
         assert!(matches!(&reported[..], [(name, text)] if name == "/map" && text.contains("no such field")));
-        for number in 0..2 * MOST {
+        for number in 0..2 * MAX_NAMES {
             losses.record_untranslated(&format!("/{number}"), "it is another");
         }
-        assert_eq!(losses.all().len(), MOST);
-        assert_eq!(recorded.0.lock().len(), MOST);
+        assert_eq!(losses.all().len(), MAX_NAMES);
+        assert_eq!(recorded.0.lock().len(), MAX_NAMES);
     }
 }

@@ -4,46 +4,58 @@
 //!
 //! ```text
 //!  robot ROS 1 ── GlobalParameters ▶ ParameterServerView ── NodeParameters ▶ servant ROS 2
+//!              ── dynamic_reconfigure ▶ ReconfigurableNode ──┘
 //!  robot ROS 2 ── NodeParameters ▶ NodeParameterView ── GlobalParameters, dynamic_reconfigure ▶ servant ROS 1
+//!              ◀── /parameter_events ──┘
 //! ```
 //! What a value of one ROS is in the other stands in the module `values`. What cannot be carried is refused in words,
 //! or, where nobody waits for an answer, left out with a line in the log.
 
+pub(super) mod event_topic;
 mod kept;
 mod launch;
 mod names;
 mod nodes;
+pub(super) mod reconfigurable;
 mod reconfigure;
 mod refusals;
 mod server;
 mod services;
+mod topics;
 mod values;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use budget::Budget;
-use ros::bus::{Bus, BusError, GlobalParameters, NodeParameters, ParameterKind, RosVersion};
+use bytes::Bytes;
+use ros::bus::{
+    Bus, BusError, GlobalParameters, NodeParameters, ParameterKind, QosProfile, RosVersion, ServiceType, Subscription,
+    WireType,
+};
+use ros::schema::MessageType;
 
 pub use launch::{LeftOutParameters, TranslatedLaunch};
 pub use nodes::NodeParameterView;
+use reconfigurable::ReconfigurableNode;
 pub use server::ParameterServerView;
 pub use services::ParameterServices;
+use topics::ParameterTopic;
 pub use values::ParameterRefusal;
 
 /// The parameters of a servant in the terms of a robot of the other ROS.
 pub enum TranslatedParameters {
-    /// Of a servant of ROS 2, for a robot of ROS 1.
+    /// Parameters of a ROS 2 servant, for a robot of ROS 1.
     Server(ParameterServerView),
-    /// Of a servant of ROS 1, for a robot of ROS 2.
-    Nodes(NodeParameterView),
+    /// Parameters of a ROS 1 servant, for a robot of ROS 2.
+    Nodes(Arc<NodeParameterView>),
 }
 
 impl TranslatedParameters {
     /// Creates the parameters of the servant with this bus. What is kept for the robot is charged to `budget`.
     pub fn new(inner: &Arc<dyn Bus>, budget: Budget) -> Self {
         match inner.version() {
-            RosVersion::One => Self::Nodes(NodeParameterView::new(Arc::clone(inner))),
+            RosVersion::One => Self::Nodes(Arc::new(NodeParameterView::new(Arc::clone(inner)))),
             RosVersion::Two => Self::Server(ParameterServerView::new(Arc::clone(inner), budget)),
         }
     }
@@ -60,7 +72,64 @@ impl TranslatedParameters {
     pub fn of_nodes(&self) -> Result<&dyn NodeParameters, BusError> {
         match self {
             Self::Server(_) => Err(BusError::NotOffered("parameters of nodes")),
-            Self::Nodes(nodes) => Ok(nodes),
+            Self::Nodes(nodes) => Ok(&**nodes),
+        }
+    }
+
+    /// Returns the topic of this name that tells the robot about parameters; `None` for other topics.
+    pub(super) fn find_topic(&self, topic: &str) -> Option<ParameterTopic> {
+        match self {
+            Self::Server(server) => reconfigurable::find_topic(&**server.bus(), topic),
+            Self::Nodes(_) => (topic == event_topic::TOPIC).then_some(ParameterTopic::Events),
+        }
+    }
+
+    /// Returns the definition of a message of such topics; `None` for other types.
+    pub(super) fn find_message(&self, of: &WireType) -> Option<Arc<MessageType>> {
+        let found = match self {
+            Self::Server(_) => reconfigurable::find_message(of),
+            Self::Nodes(_) => event_topic::message_type().ok().filter(|event| event.name() == of.name),
+        };
+        found.filter(|found| of.digest.is_compatible_with(&found.digest().into()))
+    }
+
+    /// Subscribes to such a topic.
+    pub(super) fn subscribe(
+        &self,
+        topic: ParameterTopic,
+        of: &WireType,
+        qos: QosProfile,
+    ) -> Result<Subscription, BusError> {
+        let offer = topic.offer()?;
+        match (self, topic) {
+            (Self::Server(server), ParameterTopic::Reconfigure { node, owner, part }) => {
+                ReconfigurableNode::new(server.bus(), &node).subscribe((part, owner), offer, of, qos.depth)
+            }
+            (Self::Nodes(nodes), ParameterTopic::Events) => event_topic::subscribe(nodes, offer, of, qos),
+            _ => Err(BusError::NotOffered("these topics about parameters")),
+        }
+    }
+
+    /// Returns the type of the service of this name by which the robot reads or changes parameters of a node; `None`
+    /// for other services.
+    pub(super) fn find_service_type(&self, service: &str) -> Option<Result<ServiceType, BusError>> {
+        match self {
+            Self::Server(server) => reconfigurable::find_service_type(&**server.bus(), service),
+            Self::Nodes(nodes) => ParameterServices::find_type(&nodes.bus().graph().borrow(), service),
+        }
+    }
+
+    /// Answers a call of such a service: returns the serialized response. `report` is given what the response has no
+    /// place for. The caller limits the time by dropping the future.
+    pub(super) async fn call(
+        &self,
+        service: &str,
+        request: &[u8],
+        report: &(dyn Fn(&str) + Send + Sync),
+    ) -> Result<Bytes, BusError> {
+        match self {
+            Self::Server(server) => ReconfigurableNode::call(server, service, request, report).await,
+            Self::Nodes(nodes) => ParameterServices::call(&**nodes, service, request).await,
         }
     }
 

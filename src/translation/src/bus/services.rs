@@ -17,7 +17,7 @@ use super::state::{Translation, not_translated};
 use crate::ServiceTwin;
 
 /// Maximum number of services whose types are remembered.
-const MOST: usize = 1000;
+const MAX_TYPES: usize = 1000;
 
 /// Calls a service of the servant with a request of the robot's ROS.
 pub(super) async fn call(
@@ -71,7 +71,7 @@ async fn find_called(translation: &Arc<Translation>, service: &str) -> Result<Ar
     let twin = twin.map_err(|reason| not_translated(format!("service {service}"), reason))?;
     if translation.servant_version() == RosVersion::One {
         let mut called = translation.called.lock();
-        if called.len() >= MOST {
+        if called.len() >= MAX_TYPES {
             called.clear();
         }
         called.insert(service.to_owned(), Arc::clone(&twin));

@@ -1,17 +1,17 @@
-//! What the parts of a translated bus share.
+//! State that the parts of a translated bus share.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, ServiceType, TopicPeer, WireType};
+use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, TopicPeer, WireType};
 
 use super::losses::LossCounters;
-use super::parameters::{ParameterServices, TranslatedParameters};
+use super::parameters::TranslatedParameters;
 use super::twins::{KnownTwins, Untranslatable};
 use crate::ServiceTwin;
 
-/// What the endpoints of a translated bus share.
+/// State that the endpoints of a translated bus share.
 pub(super) struct Translation {
     /// The servant's bus.
     pub(super) inner: Arc<dyn Bus>,
@@ -25,7 +25,7 @@ pub(super) struct Translation {
     pub(super) called: Mutex<HashMap<String, Arc<ServiceTwin>>>,
 }
 
-/// What a robot does not see of a servant, by kind and name (`topic /map`).
+/// Parts of a servant that a robot does not see, by kind and name (`topic /map`).
 pub type LeftOut = BTreeMap<String, LeftOutEntry>;
 
 /// A topic, service or action that is not carried.
@@ -58,14 +58,6 @@ impl TranslatedGraph {
 }
 
 impl Translation {
-    /// Returns the type of a service about parameters that a node of ROS 1 has for robots of ROS 2.
-    pub(super) fn find_parameter_service(&self, service: &str) -> Option<Result<ServiceType, BusError>> {
-        if self.version == RosVersion::One {
-            return None;
-        }
-        ParameterServices::find_type(&self.inner.graph().borrow(), service)
-    }
-
     /// Returns the ROS version of the servant.
     pub(super) fn servant_version(&self) -> RosVersion {
         self.inner.version()

@@ -1,6 +1,8 @@
 //! A robot's bus over servants of the other ROS: nodes of ROS 2 in memory, nodes of ROS 1 at a real Master.
 
 mod actions;
+mod lent_actions;
+mod parameters;
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -86,11 +88,15 @@ impl TranslationObserver for RecordedLosses {
 
 /// Returns the bus of a robot of the other ROS.
 fn translate(inner: Arc<dyn Bus>) -> (Arc<TranslatedBus>, Arc<RecordedLosses>) {
+    translate_within(inner, &Budget::without_limit())
+}
+
+/// Likewise, with the servant's budget.
+fn translate_within(inner: Arc<dyn Bus>, budget: &Budget) -> (Arc<TranslatedBus>, Arc<RecordedLosses>) {
     let losses = Arc::new(RecordedLosses::default());
     let (version, registry) = (inner.version(), definitions(inner.version()));
     let types = TypeTranslations::new(TranslationRules::default()).with_known(Arc::clone(&registry), version);
-    let budget = Budget::without_limit();
-    (TranslatedBus::new(inner, Arc::new(types), registry, Arc::clone(&losses) as _, &budget), losses)
+    (TranslatedBus::new(inner, Arc::new(types), registry, Arc::clone(&losses) as _, budget), losses)
 }
 
 /// A servant of ROS 2: a robot's bus, and a node.
@@ -147,6 +153,19 @@ fn answer(version: RosVersion, text: &str) -> Arc<Answer> {
 
 fn failure(reason: &str) -> Arc<Answer> {
     Arc::new(Answer(Err(FailureReason::new(reason))))
+}
+
+#[tokio::test]
+async fn following_the_graph_is_charged_to_the_servant() {
+    let work = budget::WorkLimit { cores: 1.0, burst: LONG };
+    let budget = Budget::new("the daemon", 1 << 20).child_with_work("servant x", 1 << 20, work);
+    let system = Arc::new(MemorySystem::default());
+    let (bus, _) = translate_within(system.join("/bridge"), &budget);
+    let before = budget.work_time();
+    let node = system.join("/see");
+    let _found = node.advertise("/found", string(RosVersion::Two), QosProfile::keep_last(5)).await;
+    wait_graph(&*bus, |graph| graph.topics.contains_key("/found")).await;
+    assert!(budget.work_time() > before);
 }
 
 #[tokio::test]
@@ -280,11 +299,11 @@ struct OneService(ServiceType, Arc<Answer>);
 #[async_trait]
 impl Lender for OneService {
     async fn find_service(&self, service: &str, _: &str) -> Option<LentService> {
-        (service == "/robot/secret").then(|| lent(self.0.clone(), Arc::clone(&self.1)))
+        (service == "/robot/secret").then(|| lent_service(self.0.clone(), Arc::clone(&self.1)))
     }
 }
 
-fn lent(service_type: ServiceType, handler: Arc<Answer>) -> LentService {
+fn lent_service(service_type: ServiceType, handler: Arc<Answer>) -> LentService {
     let (sender, gone) = watch::channel(false);
     // Without its sender it would count as gone.
     std::mem::forget(sender);
@@ -308,7 +327,7 @@ async fn a_node_of_ros_2_is_answered_even_if_the_robot_of_ros_1_fails() {
     let two = trigger(RosVersion::Two);
     let request = serialize(&two.request, &json!({}));
     for (handler, expected) in [(answer(RosVersion::One, "42"), "42"), (failure("not today"), "")] {
-        let seen = bus.lend_to_servant("/robot/secret", lent(of(), handler)).expect("it is lent");
+        let seen = bus.lend_to_servant("/robot/secret", lent_service(of(), handler)).expect("it is lent");
         assert!(seen.service_type.matches(&ServiceType::from_service(&two)));
         let response = seen.handler.call(request.clone(), "/see").await.expect("an answer");
         assert_eq!(parse(&two.response, &response)["message"], expected);
@@ -316,7 +335,7 @@ async fn a_node_of_ros_2_is_answered_even_if_the_robot_of_ros_1_fails() {
     assert!(losses.0.lock().iter().any(|text| text.contains("not today")));
     // A type that the image does not have is not lent, and the robot is told the reason once.
     for _ in 0..2 {
-        let other = lent(ServiceType::new("lab_msgs/Brew", "0"), failure("x"));
+        let other = lent_service(ServiceType::new("lab_msgs/Brew", "0"), failure("x"));
         assert!(bus.lend_to_servant("/brew", other).is_err());
     }
     let told = losses.0.lock().clone();
@@ -415,9 +434,12 @@ fn a_process_of_ros_2_is_one_node_of_ros_1() {
     assert_eq!(graph.topics["/other"].publishers, ["/other"]);
     assert_eq!(graph.sought["/robot/secret"], ["/see"]);
     assert_eq!(graph.nodes.keys().collect::<Vec<_>>(), ["/other", "/see"]);
-    // What belongs to ROS 2 itself is neither shown nor missed.
-    assert_eq!(graph.topics.len(), 2);
-    assert!(graph.services.is_empty() && translated.left_out.is_empty(), "{:?}", translated.left_out);
+    // What belongs to ROS 2 itself is neither shown nor missed; ROS 1 has dynamic_reconfigure instead.
+    let topics: Vec<_> = graph.topics.keys().collect();
+    assert_eq!(topics, ["/eye/parameter_descriptions", "/eye/parameter_updates", "/found", "/other"]);
+    assert_eq!(graph.topics["/eye/parameter_updates"].publishers, ["/see"]);
+    assert_eq!(graph.services, [("/eye/set_parameters".to_owned(), "/see".to_owned())].into());
+    assert!(translated.left_out.is_empty(), "{:?}", translated.left_out);
     assert_eq!(PeerId::new("/eye", 7).with_node("/see"), PeerId::new("/see", 7));
 }
 

@@ -11,7 +11,7 @@ use crate::twins::{MAX_KEPT_BYTES, TypePair};
 use crate::{ActionTwin, MessageTranslator, MessageTwin, NoTwin, ServiceTwin, TypeTranslations};
 
 /// Maximum number of types remembered, which take at most [`MAX_KEPT_BYTES`]; beyond it they are found anew.
-const MOST: usize = 4096;
+const MAX_TYPES: usize = 4096;
 /// Maximum number of definitions of one name that are remembered.
 const MOST_OF_NAME: usize = 8;
 
@@ -26,7 +26,7 @@ pub(super) enum Untranslatable {
     NoDefinition {
         /// Name of the type.
         name: String,
-        /// What is missing.
+        /// Reason why no twin was found.
         source: SchemaError,
     },
     /// The other ROS has no such type.
@@ -35,12 +35,6 @@ pub(super) enum Untranslatable {
     /// The other ROS does not allow the name.
     #[error("ROS 2 does not allow this name: a part of it is empty or begins with a digit; remap it")]
     Name,
-    /// A node of the servant is a client of the action.
-    #[error(
-        "no node of the service serves this action, and actions that a robot serves are not carried between ROS 1 and \
-         ROS 2: run the client and the server in the same ROS"
-    )]
-    ActionOfRobot,
     /// The action cannot be made of parts of the other ROS.
     #[error(transparent)]
     Parts(BusError),
@@ -75,7 +69,7 @@ fn remember<T: TypePair>(known: &Mutex<RememberedTwins<T>>, name: &str, twin: &A
         return;
     }
     let bytes = twin.bytes_held();
-    if known.by_name.len() >= MOST || known.bytes.saturating_add(bytes) > MAX_KEPT_BYTES {
+    if known.by_name.len() >= MAX_TYPES || known.bytes.saturating_add(bytes) > MAX_KEPT_BYTES {
         *known = RememberedTwins::default();
     }
     let of_name = known.by_name.entry(name.to_owned()).or_default();
@@ -200,6 +194,11 @@ impl KnownTwins {
 
     /// Returns the definition of a service of the image's actions, as a robot of ROS 2 sees it.
     pub(super) fn service_of_action(&self, of: &ServiceType) -> Option<Arc<ServiceDef>> {
+        if of.name.starts_with("action_msgs/") {
+            // Every registry has what is common to all actions.
+            let common = Registry::for_version(self.version).service(&of.name).ok()?;
+            return of.matches(&ServiceType::from_service(&common)).then_some(common);
+        }
         let (action, _) = of.name.rsplit_once('_')?;
         let twin = self.action_with_twin(action)?;
         let services = twin.twin.services.as_ref()?;

@@ -81,7 +81,7 @@ pub(super) struct Rule {
 /// Pairs of field paths, in the order of the file.
 pub(super) type FieldPairs = Vec<(String, String)>;
 
-/// What a rule is about.
+/// Subject of a rule.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum About {
     Packages,

@@ -22,7 +22,7 @@ const LOSSY: [&str; 4] = [
 ];
 
 /// Returns the definitions of the environment with ROS 2.
-fn packaged() -> Arc<Registry> {
+fn packaged_registry() -> Arc<Registry> {
     let prefix = std::env::var_os("CLOUDROID_ROS2_PREFIX");
     let prefix = prefix.expect("CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test");
     let registry = Registry::for_version(Two);
@@ -88,12 +88,12 @@ fn check(
             assert_eq!(to_twin.translate(&carried).unwrap(), bytes, "{twin:?}, round {round}");
         }
     }
-    assert_eq!(to_twin.saturated() + from_twin.saturated(), 0, "{original:?}");
+    assert_eq!(to_twin.saturated_count() + from_twin.saturated_count(), 0, "{original:?}");
 }
 
 #[test]
 fn every_packaged_definition_has_a_twin_and_its_messages_come_back() {
-    let registry = packaged();
+    let registry = packaged_registry();
     let translations = TypeTranslations::new(TranslationRules::default());
     let (mut messages, mut services, mut actions) = (0, 0, 0);
     for key in registry.keys() {
@@ -124,7 +124,7 @@ fn every_packaged_definition_has_a_twin_and_its_messages_come_back() {
 /// A node of ROS 1 refuses messages whose MD5 is not that of the definition that it was compiled with.
 #[test]
 fn derived_definitions_have_the_md5_of_debian_s_packages() {
-    let registry = packaged();
+    let registry = packaged_registry();
     let translations = TypeTranslations::new(TranslationRules::default());
     let mut compared = 0;
     for line in DEBIAN.lines() {
@@ -146,7 +146,7 @@ fn derived_definitions_have_the_md5_of_debian_s_packages() {
 /// A node of ROS 2 reads messages by the definition that it was compiled with, whatever they were written by.
 #[test]
 fn twins_of_twins_have_the_hash_of_the_package() {
-    let registry = packaged();
+    let registry = packaged_registry();
     let translations = TypeTranslations::new(TranslationRules::default());
     for line in DEBIAN.lines().filter(|line| !line.contains("/srv/")) {
         let name = line.split_once(' ').unwrap().0;

@@ -204,7 +204,7 @@ fn damage(bytes: &mut Vec<u8>, edits: &[(u16, u8, u8)]) {
 }
 
 /// Returns a definition with the same fields in another order, and one more.
-fn shuffled(message: &MessageType, choices: &mut Choices<'_>) -> String {
+fn shuffle_fields(message: &MessageType, choices: &mut Choices<'_>) -> String {
     let mut lines: Vec<&str> = message.text().lines().collect();
     lines.push("float64 extra");
     let mut text = String::new();
@@ -226,7 +226,7 @@ proptest! {
             let carried = pair.to_twin.translate(&bytes).unwrap();
             ros_message::codec::validate(&pair.twin, &carried).unwrap();
             prop_assert_eq!(&pair.from_twin.translate(&carried).unwrap()[..], &bytes[..]);
-            prop_assert_eq!(pair.to_twin.saturated() + pair.from_twin.saturated(), 0);
+            prop_assert_eq!(pair.to_twin.saturated_count() + pair.from_twin.saturated_count(), 0);
             // In the other byte order they say the same.
             if version == Two {
                 let (_, big) = random(version, &choices, true);
@@ -243,7 +243,7 @@ proptest! {
         let mut order = Choices::new(&choices);
         for level in 0..3 {
             if let Ok(message) = registry.message(&format!("a/T{level}")) {
-                registry.insert(&format!("a/T{level}"), &shuffled(&message, &mut order)).unwrap();
+                registry.insert(&format!("a/T{level}"), &shuffle_fields(&message, &mut order)).unwrap();
             }
         }
         let translations = TypeTranslations::new(TranslationRules::default()).with_known(Arc::new(registry), Two);

@@ -165,6 +165,18 @@ fn types_without_a_twin_say_why() {
     assert!(same.to_string().contains("fields k and K of a/B would have one name in ROS 2"), "{same}");
     let none = twin_by(TranslationRules::default(), One, &[("a/B", "uint8[0] k")]).unwrap_err();
     assert!(matches!(*none.reason, NoTwinReason::Definition(_)), "{none}");
+    // Who sends nothing would have millions of bytes written.
+    for version in [One, Two] {
+        let names = if version == One { ["a/B", "a/Nothing"] } else { ["a/msg/B", "a/msg/Nothing"] };
+        let of_length = |length: usize| {
+            let text = format!("Nothing[{length}] k\nuint8 more");
+            twin_by(TranslationRules::default(), version, &[(names[0], &text), (names[1], "")])
+        };
+        assert!(of_length(1 << 20).is_ok(), "{version:?}");
+        let refused = of_length((1 << 20) + 1).unwrap_err();
+        assert!(matches!(*refused.reason, NoTwinReason::EmptySize { one_bytes: 1, .. }), "{refused}");
+        assert!(refused.to_string().contains("shorten the arrays of fixed length"), "{refused}");
+    }
     // Both ways, and kept.
     let translations =
         TypeTranslations::new(TranslationRules::default()).with_known(registry(One, &[("a/B", "uint8 d")]), One);

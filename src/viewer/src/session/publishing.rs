@@ -17,7 +17,7 @@ use super::{CONNECTS, FinishedTask, OUTGOING, Session};
 /// Limit on the topics that one viewer may advertise.
 const ADVERTISEMENTS: usize = 512;
 /// Minimum queue size of a viewer's topic towards a slow node.
-const PUBLISHED: usize = 10;
+const MIN_QUEUE: usize = 10;
 
 /// Reason why a topic of a viewer is not advertised.
 #[derive(Debug, thiserror::Error)]
@@ -124,7 +124,7 @@ impl Session {
         self.granted.check(Operation::Publish, topic)?;
         let message = self.registry.message(&channel.schema_name);
         let message = message.map_err(|source| AdvertiseError::UnknownType { topic: topic.to_owned(), source })?;
-        let qos = QosProfile::keep_last(self.depth.max(PUBLISHED));
+        let qos = QosProfile::keep_last(self.depth.max(MIN_QUEUE));
         let publisher = self.bus.advertise(topic, WireType::from_message(&message), qos).await;
         let publisher = publisher.map_err(|source| AdvertiseError::Bus { topic: topic.to_owned(), source })?;
         Ok((message, publisher))

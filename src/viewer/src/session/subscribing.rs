@@ -17,7 +17,7 @@ use crate::line::ViewerFrame;
 /// Limit on one viewer's subscriptions.
 const SUBSCRIPTIONS: usize = 512;
 /// Minimum interval between two warnings about dropped messages of a topic.
-const MISSED: Duration = Duration::from_secs(5);
+const WARNING_INTERVAL: Duration = Duration::from_secs(5);
 
 /// A subscription of the viewer; unsubscribes when dropped.
 pub(super) struct ViewerSubscription {
@@ -103,7 +103,7 @@ impl SubscriptionForwarder {
             }
             let missed = self.missed + subscription.dropped.get();
             let (told, at) = self.told;
-            if missed > told && (told == 0 || at.elapsed() >= MISSED) {
+            if missed > told && (told == 0 || at.elapsed() >= WARNING_INTERVAL) {
                 self.told = (missed, Instant::now());
                 let words = format!(
                     "{}: {missed} messages were dropped, since they arrive faster than they are read",

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
 """Minds what many nodes mind: how old its input is, which transforms it was told, what time it is."""
+import functools
+import threading
 import time
 
 import actionlib
 import rospy
-from actionlib.msg import TestAction, TestFeedback, TestResult
+from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -50,6 +52,28 @@ def act(goal):
     server.set_succeeded(TestResult(goal.goal))
 
 
+@functools.lru_cache()
+def find_arm():
+    arm = actionlib.SimpleActionClient("/robot/act", TestAction)
+    arm.wait_for_server()
+    return arm
+
+
+def send(_):
+    arm = find_arm()
+    arm.send_goal_and_wait(TestGoal(3))
+    return TriggerResponse(arm.get_state() == actionlib.GoalStatus.SUCCEEDED, str(arm.get_result().result))
+
+
+def stop(_):
+    arm, moves = find_arm(), threading.Event()
+    arm.send_goal(TestGoal(1000000), feedback_cb=lambda _: moves.set())
+    moves.wait()
+    arm.cancel_goal()
+    arm.wait_for_result()
+    return TriggerResponse(arm.get_state() == actionlib.GoalStatus.PREEMPTED, str(arm.get_result().result))
+
+
 def ask(_):
     answer = rospy.ServiceProxy("/robot/secret", Trigger)()
     return TriggerResponse(answer.success, "the robot says " + answer.message)
@@ -69,6 +93,8 @@ rospy.Service("~now", Trigger, lambda _: TriggerResponse(True, str(rospy.Time.no
 rospy.Service("~label", Trigger, lambda _: TriggerResponse(True, str(rospy.get_param("~label", "none"))))
 rospy.Service("~ask", Trigger, ask)
 rospy.Service("~wait", Trigger, wait)
+rospy.Service("~send", Trigger, send)
+rospy.Service("~stop", Trigger, stop)
 server = actionlib.SimpleActionServer("~act", TestAction, act, auto_start=False)
 server.start()
 rospy.spin()

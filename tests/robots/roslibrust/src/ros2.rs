@@ -41,7 +41,7 @@ fn text(data: &str) -> Text {
     Text { data }
 }
 
-fn named(name: &str) -> Named {
+fn greet_request(name: &str) -> Named {
     let name = name.to_owned();
     Named { name }
 }
@@ -72,7 +72,7 @@ pub async fn does_all(ros: ClientHandle, other: ClientHandle) -> Result<()> {
         is_now && greeting.manner == 1 && greeting.at.len() == 2,
     )?;
 
-    let greeted = ros.call_service::<Greet>("/greet", named("Jürgen")).await?;
+    let greeted = ros.call_service::<Greet>("/greet", greet_request("Jürgen")).await?;
     let greets = greeted.greeting.wide == "HELLO, JÜRGEN" && !greeted.known;
     check("a node's service", greets)?;
     let light = |request: Switch| {
@@ -112,7 +112,7 @@ pub async fn does_all(ros: ClientHandle, other: ClientHandle) -> Result<()> {
         .call_service::<SetParam>("/rosapi/set_param", entry)
         .await?;
     check("a parameter set", done.successful)?;
-    let greeted = ros.call_service::<Greet>("/greet", named("Jürgen")).await?;
+    let greeted = ros.call_service::<Greet>("/greet", greet_request("Jürgen")).await?;
     let hails = greeted.greeting.text == "Hail, Jürgen" && greeted.known;
     check("set in the node", hails)?;
     let now = ros

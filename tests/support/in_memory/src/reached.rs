@@ -4,9 +4,8 @@
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use bridge::{Metrics, SessionEnd, SessionOptions, WaitingConnection};
+use bridge::{SessionEnd, SessionOptions, WaitingConnection};
 use futures_util::future::BoxFuture;
-use link::session::DisconnectReason;
 use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
@@ -24,7 +23,6 @@ use crate::servants::MemoryServant;
 
 struct MemoryReach {
     servant: Arc<MemoryServant>,
-    metrics: Metrics,
     tenant: Mutex<Option<Weak<dyn Tenant>>>,
     closed: watch::Sender<Option<String>>,
 }
@@ -43,7 +41,6 @@ impl Opener for MemoryEngine {
         let servant = self.servant(id);
         Ok(Arc::new(MemoryReach {
             servant: servant.ok_or_else(|| Error::Elsewhere(id.to_owned()))?,
-            metrics: Metrics::default(),
             tenant: Mutex::default(),
             closed: watch::Sender::default(),
         }))
@@ -98,9 +95,11 @@ impl Reach for MemoryReach {
         Err((1011, "nothing passes here".to_owned()))
     }
 
-    async fn serve_link(&self, _stream: UpgradedStream, _read_ahead: &[u8]) -> DisconnectReason {
-        let reason = self.wait_until_closed().await;
-        DisconnectReason::Closed { code: 1012, reason }
+    async fn serve_link(&self, _stream: UpgradedStream, _read_ahead: &[u8], end: BoxFuture<'_, String>) -> String {
+        tokio::select! {
+            reason = self.wait_until_closed() => reason,
+            reason = end => reason,
+        }
     }
 
     fn links(&self) -> Vec<LinkStatus> {
@@ -119,10 +118,6 @@ impl Reach for MemoryReach {
 
     fn inputs(&self) -> Vec<(String, SizeSummary)> {
         self.servant.inputs.summaries()
-    }
-
-    fn metrics(&self) -> &Metrics {
-        &self.metrics
     }
 
     async fn replay(

@@ -99,6 +99,11 @@ impl MemoryServant {
         })
     }
 
+    /// Hides its state, as a shim does that has not answered the next daemon, or tells it.
+    pub fn hide_state(&self, is_hidden: bool) {
+        self.state.send_replace(if is_hidden { ContainerState::Creating } else { ContainerState::Running });
+    }
+
     /// Ends it like a broken container.
     pub fn fail(&self, reason: &str) {
         self.end(ContainerState::Failed { reason: reason.to_owned() });

@@ -15,14 +15,14 @@ use crate::client_state::ActionServer;
 use crate::sample::EncodedFrame;
 
 /// Reason for aborting goals.
-const GONE: &str = "the client that serves this action is gone";
+const CLIENT_GONE: &str = "the client that serves this action is gone";
 
 /// Forwards goals to the client.
 struct GoalHandler(Weak<ActionServer>);
 
 impl ActionHandler for GoalHandler {
     fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
-        let gone = || FailureReason::new(GONE);
+        let gone = || FailureReason::new(CLIENT_GONE);
         let server = self.0.upgrade().ok_or_else(gone)?;
         let client = server.client.upgrade().ok_or_else(gone)?;
         let sent = server.send_goal(&client, id, &goal);
@@ -55,6 +55,7 @@ impl ActionServer {
         let server = Arc::new(Self {
             name: name.to_owned(),
             written: op.action.clone().into_owned(),
+            written_type: op.type_name.clone().into_owned(),
             def,
             compression: op.compression,
             goals: Mutex::default(),
@@ -82,7 +83,7 @@ impl ActionServer {
         let mut out = Vec::with_capacity(256 + body.len());
         let mut writer = Writer::op(&mut out, format, "send_action_goal", Some(&Id::from(request)));
         writer.text("action", &self.written);
-        writer.text("action_type", &self.def.name);
+        writer.text("action_type", &self.written_type);
         if self.compression == Compression::CborRaw {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, body);
@@ -148,8 +149,11 @@ impl Drop for ActionServer {
         let goals = std::mem::take(self.goals.get_mut());
         for id in goals.into_values() {
             if let Some(bus) = self.bus.get() {
-                let end =
-                    GoalEnd { outcome: GoalOutcome::Aborted, text: GONE.to_owned(), result: self.default_result() };
+                let end = GoalEnd {
+                    outcome: GoalOutcome::Aborted,
+                    text: CLIENT_GONE.to_owned(),
+                    result: self.default_result(),
+                };
                 bus.end_goal(&id, end);
             }
         }

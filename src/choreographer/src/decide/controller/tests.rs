@@ -100,7 +100,7 @@ fn what_was_moved_goes_back_when_it_is_over() {
     assert!(moved[0].quota * 10 > CORES * 9, "{:?}", moved[0]);
     assert!(moved[0].weight * 10 > 2000 * 9, "{:?}", moved[0]);
     let most = moved[0].quota;
-    assert_eq!((moved[1].quota, moved[1].weight), (LEAST, 1));
+    assert_eq!((moved[1].quota, moved[1].weight), (MIN_QUOTA, 1));
     assert_eq!((moved[2].quota, moved[2].weight), (2000, 2000));
     moved[0].measured = Some(MeasuredTimes { total: 80.0, cloud: 40.0 });
     moved[0].throttled = 0.0;
@@ -133,7 +133,7 @@ fn those_that_are_near_are_not_throttled_for_each_other() {
     let (eager, patient) = all.split_at(4);
     for one in eager {
         // The need of the patient ones, which use 60 each, is left to them.
-        let beyond = CORES - 4 * (60 + 60 / HEADROOM + LEAST);
+        let beyond = CORES - 4 * (60 + 60 / HEADROOM + MIN_QUOTA);
         assert!(one.quota <= beyond && one.quota * 10 > beyond * 9, "{one:?}");
         assert_eq!(one.weight, 500, "what is promised to others stays theirs");
     }
@@ -349,7 +349,7 @@ proptest! {
             let weights: u64 = all.iter().map(|one| one.weight).sum();
             for one in &all {
                 prop_assert!(one.quota >= one.promised, "{} is bounded below its promise", one.id);
-                prop_assert!(one.quota >= LEAST.min(one.limit) && one.quota <= one.ceiling.max(one.limit));
+                prop_assert!(one.quota >= MIN_QUOTA.min(one.limit) && one.quota <= one.ceiling.max(one.limit));
                 prop_assert!((1..=10_000).contains(&one.weight));
                 // Its share by weight under full contention is its promise, up to the threshold for changes and the
                 // minimum weight.

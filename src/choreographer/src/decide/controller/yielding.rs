@@ -7,7 +7,9 @@
 
 use std::time::{Duration, Instant};
 
-use super::{ControlFacts, ControlHistory, DOUBLED, HINDERED, HOLD, MeasuredTimes, ResponseGoal, elapsed_since};
+use super::{
+    ControlFacts, ControlHistory, HINDERED_SHARE, HOLD, MAX_HOLD_DOUBLINGS, MeasuredTimes, ResponseGoal, elapsed_since,
+};
 
 /// Fraction of the cores in use at which they count as used up: the rest is overhead.
 const FULL: f64 = 0.85;
@@ -19,7 +21,7 @@ impl ControlFacts<'_> {
     fn is_late(&self, now: Instant) -> bool {
         let measured = self.measured.zip(self.goal.and_then(ResponseGoal::upper_bound));
         measured.is_some_and(|(measured, bound)| measured.total > bound)
-            && self.throttled < HINDERED
+            && self.throttled < HINDERED_SHARE
             && elapsed_since(self.history.raised, now) >= HOLD
     }
 
@@ -95,7 +97,7 @@ pub(super) fn update_yields(cores: u64, servants: &[ControlFacts<'_>], histories
         let fits = |demand: u64| beside + demand <= cores;
         let again = since >= RETRY * 2u32.pow(history.vain);
         if again {
-            history.vain = DOUBLED.min(history.vain + 1);
+            history.vain = MAX_HOLD_DOUBLINGS.min(history.vain + 1);
         }
         if again || (since >= HOLD && (sharing == 0 || one.demanded_cores().is_some_and(fits))) {
             history.yielded = None;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::{MachineStep, SERVICES};
 use crate::decide::admission::{
-    AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, OVERTAKEN, Ticket,
+    AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, MAX_OVERTAKES, Ticket,
 };
 use crate::decide::capacity::{PushPromise, RoomPlan};
 use crate::decide::lifetime::{Retention, ServantStage, Tenancy, retention};
@@ -206,7 +206,7 @@ impl MachineModel {
         for one in &mut self.line[..earlier] {
             assert!(one.priority < priority, "a robot was overtaken");
             one.overtaken += 1;
-            assert!(one.overtaken <= OVERTAKEN, "a robot waits for ever");
+            assert!(one.overtaken <= MAX_OVERTAKES, "a robot waits for ever");
         }
     }
 

@@ -5,7 +5,7 @@ use serde_json::{Number, Value};
 /// Maximum number of fields reported for one answer.
 pub(super) const FIELDS: usize = 32;
 /// Maximum number of characters shown of a value.
-const SHOWN: usize = 60;
+const MAX_SHOWN_VALUE: usize = 60;
 
 /// Tolerated differences.
 #[derive(Debug, Clone)]
@@ -112,9 +112,9 @@ fn is_header(value: &Value) -> bool {
 
 fn shorten(text: String) -> String {
     let length = text.chars().count();
-    if length <= SHOWN {
+    if length <= MAX_SHOWN_VALUE {
         return text;
     }
-    let head: String = text.chars().take(SHOWN).collect();
+    let head: String = text.chars().take(MAX_SHOWN_VALUE).collect();
     format!("{head}… ({length} characters)")
 }

@@ -15,7 +15,7 @@ use crate::lives::shared_group::{GroupStage, SharedGroup, SharedServant};
 use crate::lives::{ChoreographerInner, Servants};
 
 /// Prefix of a group's name, in place of a robot's name.
-const NAMED: &str = "~group-";
+const NAME_PREFIX: &str = "~group-";
 
 /// Updates the state of the servants; returns the failure of one that never answered.
 pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Option<Failure> {
@@ -143,7 +143,7 @@ pub(super) fn take_back(inner: &ChoreographerInner, shares: &SharedGroup, reason
 /// Returns a lease of a group's servant with this number: the existing one, or a new one; `None` if the daemon is
 /// ending.
 fn find_or_start(inner: &Arc<ChoreographerInner>, revision: &Arc<RevisionRecord>, number: usize) -> Option<Lease> {
-    let robot = format!("{NAMED}{}-{number}", revision.number);
+    let robot = format!("{NAME_PREFIX}{}-{number}", revision.number);
     let key = (revision.service.clone(), robot.clone());
     let mut servants = inner.servants.lock();
     if inner.is_ending() {

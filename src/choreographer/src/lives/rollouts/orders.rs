@@ -10,7 +10,7 @@ use super::{ChoreographerInner, PromotionBlocker, Rollout, is_ongoing, run_rollo
 use crate::{Choreographer, Error};
 
 /// Maximum number of differences named in an error.
-const NAMED: usize = 8;
+const MAX_NAMED_DIFFERENCES: usize = 8;
 
 fn to_api(service: &str, of: &Rollout, waits: Option<PromotionBlocker>) -> api::Rollout {
     api::Rollout {
@@ -212,7 +212,7 @@ fn check_compatible(stable: &RevisionRecord, candidate: &RevisionRecord) -> Resu
         return Ok(());
     }
     let breaking = difference.changes.iter().filter(|it| !it.compatible);
-    let words: Vec<String> = breaking.take(NAMED).map(ToString::to_string).collect();
+    let words: Vec<String> = breaking.take(MAX_NAMED_DIFFERENCES).map(ToString::to_string).collect();
     Err(Error::Rollout(format!(
         "revision {} of {} cannot be a canary: its interface breaks robots of revision {}: {}",
         candidate.number,

@@ -23,7 +23,7 @@ const ACTION: Duration = Duration::from_secs(10);
 /// Timeout for looking up a service's type.
 const TYPE: Duration = Duration::from_secs(5);
 /// Maximum number of calls and goals by which the candidate may be behind; more are left out.
-const BEHIND: usize = 64;
+const MAX_BACKLOG: usize = 64;
 
 /// Calls and goals, in progress and answered.
 pub(super) struct Exchanges {
@@ -99,8 +99,8 @@ impl Exchanges {
         registry: &Registry,
         notes: &mut ComparisonNotes,
     ) {
-        if self.answers.len() >= BEHIND {
-            let why = format!("the candidate had {BEHIND} unanswered calls and goals");
+        if self.answers.len() >= MAX_BACKLOG {
+            let why = format!("the candidate had {MAX_BACKLOG} unanswered calls and goals");
             return notes.add(name_of(&what), &why);
         }
         let done = CancellationToken::new();

@@ -32,7 +32,7 @@ const SETTLES: (Duration, Duration) = (Duration::from_millis(200), Duration::fro
 /// Maximum size of a message as JSON, in bytes; a larger one is compared as a whole.
 const LONGEST: usize = 4 << 20;
 /// Maximum number of interface differences reported.
-const NAMED: usize = 8;
+const MAX_NAMED_DIFFERENCES: usize = 8;
 
 /// A comparison.
 pub(super) struct Mirror<'a> {
@@ -85,8 +85,7 @@ impl<'a> Mirror<'a> {
     ) -> Result<Mirror<'a>, Error> {
         let gone = || Error::Shadow(format!("robot {} left while the candidate was starting", present.robot));
         let there = present.reach().ok_or_else(gone)?;
-        let tap = there.tap().ok_or_else(gone)?;
-        let tapping = tap.listen(budget).ok_or_else(|| {
+        let tapping = there.tap(budget).await.ok_or_else(|| {
             Error::Shadow(format!(
                 "servant {} of robot {} is already being compared with a candidate; wait until that ends",
                 present.id, present.robot
@@ -335,7 +334,7 @@ fn note_interfaces(present: &Handle, candidate: &Handle, notes: &mut ComparisonN
     let (one, other) = (&present.revision, &candidate.revision);
     let difference = Difference::compare(&one.interface, &other.interface);
     let breaking = difference.changes.iter().filter(|it| !it.compatible);
-    for change in breaking.take(NAMED) {
+    for change in breaking.take(MAX_NAMED_DIFFERENCES) {
         let why = format!("the interfaces of revisions {} and {} differ", one.number, other.number);
         notes.add_many(&change.to_string(), &why, 0);
     }

@@ -284,7 +284,7 @@ impl MirroredTopics {
         self.candidate.record(None, Instant::now());
     }
 
-    /// At the first request: outputs received just before it may answer it.
+    /// Releases early outputs at the first request: those received just before may answer it.
     fn release_early(&mut self, at: Instant) {
         if self.present.count > 0 {
             return;

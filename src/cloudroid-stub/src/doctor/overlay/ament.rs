@@ -9,13 +9,11 @@ use super::{ExaminedStub, found_check, is_same_directory, shadowed_check};
 use crate::network::{self, Variable};
 
 const INDEX: &str = "share/ament_index/resource_index";
-/// Middleware implementations of ROS 2 that use RTPS and were tested with stubs.
-const TRIED: [&str; 3] = ["rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp"];
 
 /// Runs all checks for ROS 2.
 pub async fn checks(stub: &ExaminedStub, variable: Variable<'_>) -> Vec<Check> {
     let prefixes = prefixes(variable);
-    let mut checks = vec![shadowing(stub, &prefixes), middleware(variable), domain(variable).await];
+    let mut checks = vec![shadowing(stub, &prefixes), domain(variable).await];
     checks.extend(security(variable));
     checks.extend(messages(stub, &prefixes));
     checks
@@ -33,28 +31,6 @@ fn shadowing(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Check {
     match first {
         Some(first) if is_same_directory(first, &stub.overlay()) => found_check(stub),
         first => shadowed_check("AMENT_PREFIX_PATH", first, stub),
-    }
-}
-
-fn middleware(variable: Variable<'_>) -> Check {
-    const NAME: &str = "RMW_IMPLEMENTATION";
-    let chosen = variable(NAME).filter(|value| !value.is_empty());
-    match chosen.as_deref() {
-        None => Check::good("middleware", format!("{NAME} is not set: default of the distribution")),
-        Some(tried) if TRIED.contains(&tried) => Check::good("middleware", tried),
-        Some(zenoh) if zenoh.starts_with("rmw_zenoh") => Check::bad(
-            "middleware",
-            format!(
-                "{zenoh} does not use DDS, the only protocol of stubs: this robot's nodes and the stub cannot \
-                    communicate"
-            ),
-            format!("export {NAME}=rmw_fastrtps_cpp (or rmw_cyclonedds_cpp), for all nodes of this robot"),
-        ),
-        Some(other) => Check::warning(
-            "middleware",
-            format!("{other} is untested with stubs; it works if it implements RTPS as specified by OMG"),
-            format!("if nodes cannot communicate: export {NAME}=rmw_fastrtps_cpp"),
-        ),
     }
 }
 
@@ -190,9 +166,6 @@ mod tests {
     async fn what_keeps_nodes_from_hearing_each_other_is_said() {
         let robot = Robot::new();
         for (name, value, check, verdict, said) in [
-            ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp", "middleware", CheckVerdict::Good, "cyclone"),
-            ("RMW_IMPLEMENTATION", "rmw_connextdds", "middleware", CheckVerdict::Warning, "untested"),
-            ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "middleware", CheckVerdict::Bad, "does not use DDS"),
             ("ROS_DOMAIN_ID", "7", "domain", CheckVerdict::Good, "7, on all networks"),
             ("ROS_LOCALHOST_ONLY", "1", "domain", CheckVerdict::Good, "0, on this machine only"),
             (

@@ -29,8 +29,8 @@ use super::goal_messages::{self as messages, ALL, GoalId};
 use super::{Keeper, Payload};
 
 /// Time for which results are kept for late requests, and their largest number.
-const KEPT: Duration = Duration::from_secs(900);
-const MOST: usize = 1000;
+const RESULT_EXPIRY: Duration = Duration::from_secs(900);
+const MAX_RESULTS: usize = 1000;
 
 /// A goal as it was sent.
 #[derive(Debug)]
@@ -100,9 +100,9 @@ impl KeeperGoal {
 
 impl KeeperGoals {
     fn insert(&mut self, now: Instant, id: GoalId, goal: KeeperGoal) {
-        let old = |goal: &KeeperGoal| goal.ended.is_some_and(|ended| now - ended > KEPT);
+        let old = |goal: &KeeperGoal| goal.ended.is_some_and(|ended| now - ended > RESULT_EXPIRY);
         self.0.retain(|_, goal| !old(goal));
-        if self.0.len() >= MOST {
+        if self.0.len() >= MAX_RESULTS {
             let ended = self.0.iter().filter_map(|(id, goal)| Some((goal.ended?, *id)));
             if let Some((_, oldest)) = ended.min() {
                 self.0.remove(&oldest);

@@ -16,7 +16,7 @@ use super::{
 use crate::local::private_system::PrivateSystem;
 use crate::local::process::{self, OriginalProgram};
 use crate::local::remembered::RememberedSettings;
-use crate::seen;
+use crate::node_interface;
 
 /// First and longest pause after crashes, and the run time that resets the pause.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
@@ -159,7 +159,7 @@ impl OriginalRunner {
         let sources = self.sources.lock().clone();
         for (topic, source) in sources {
             let mut nodes = nodes.iter();
-            if nodes.any(|node| seen::publishes(&graph, node, &topic)) {
+            if nodes.any(|node| node_interface::publishes(&graph, node, &topic)) {
                 wait_for_connected(source, 1).await;
             }
         }
@@ -173,7 +173,7 @@ impl OriginalRunner {
 /// Returns whether one of these nodes subscribes to the topic.
 fn any_subscribes(graph: &Graph, nodes: &BTreeSet<String>, topic: &str) -> bool {
     let mut nodes = nodes.iter();
-    nodes.any(|node| seen::subscribes(graph, node, topic))
+    nodes.any(|node| node_interface::subscribes(graph, node, topic))
 }
 
 /// Waits for the command to stop, or for the handle to be dropped.

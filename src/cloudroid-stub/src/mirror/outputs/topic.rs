@@ -62,7 +62,7 @@ struct LatchedOutput {
 /// Advertisement of the latched messages.
 #[derive(Default)]
 enum LatchedAdvertisement {
-    /// The same as for all other messages.
+    /// No difference from other messages.
     #[default]
     Plainly,
     /// An advertisement for them has been requested; messages are queued until it is made.

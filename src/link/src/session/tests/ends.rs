@@ -3,7 +3,7 @@
 use super::*;
 
 /// More than the buffers of a socket hold if nobody reads it.
-const MUCH: usize = 4 << 20;
+const UNREAD_BYTES: usize = 4 << 20;
 
 #[tokio::test]
 async fn a_session_whose_connection_is_dropped_is_down() {
@@ -27,7 +27,7 @@ async fn a_session_ends_although_the_other_end_takes_nothing_any_more() {
     open(&robot, &cloud);
     let (mut at_robot, _at_cloud) = sockets();
     let nobody = RecordSender(mpsc::unbounded_channel().0);
-    robot.answer(1, 0, Ok(vec![0; MUCH].into()));
+    robot.answer(1, 0, Ok(vec![0; UNREAD_BYTES].into()));
     let begun = Instant::now();
     let (lost, ()) = tokio::join!(robot.run(&mut at_robot, &nobody), async {
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -43,7 +43,7 @@ async fn a_close_is_heard_though_whoever_sent_it_reads_nothing_any_more() {
     open(&robot, &cloud);
     let (mut at_robot, mut at_cloud) = sockets();
     let nobody = RecordSender(mpsc::unbounded_channel().0);
-    robot.answer(1, 0, Ok(vec![0; MUCH].into()));
+    robot.answer(1, 0, Ok(vec![0; UNREAD_BYTES].into()));
     let begun = Instant::now();
     let (lost, ()) = tokio::join!(robot.run(&mut at_robot, &nobody), async {
         tokio::time::sleep(Duration::from_secs(1)).await;

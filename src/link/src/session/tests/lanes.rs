@@ -102,7 +102,7 @@ fn lines_for_a_link_that_is_away_do_not_end_the_session_and_those_left_out_are_t
     for number in 0..100_000 {
         cloud.send_control(&line(number));
     }
-    assert_eq!(cloud.state.lock().out.overflow_reason(), None);
+    assert_eq!(cloud.state.lock().out.overflow_reason, None);
     let came = lines(&carry(&cloud, &robot));
     assert_eq!(came.last().map(String::as_str), Some("99999"), "the newest stay");
     let kept = came.len() - 1;
@@ -181,7 +181,7 @@ fn a_cancel_does_not_overtake_its_call() {
     let cancel = robot.call(2, Bytes::new());
     let came = carry(&robot, &cloud);
     let ids = came.iter().map(|record| match record {
-        Record::Call { id, .. } => *id,
+        Record::Call(Call { id, .. }) => *id,
         other => panic!("{other:?}"),
     });
     assert_eq!(ids.collect::<Vec<_>>(), [goal, cancel]);

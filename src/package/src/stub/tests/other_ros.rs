@@ -32,7 +32,7 @@ fn robots_of_ros_1_get_an_overlay_of_catkin_for_a_service_of_ros_2() {
     assert!(text(&files["share/p/message_packages/p/CMakeLists.txt"]).contains("FILES T.msg)"));
     assert!(text(&files["lib/p/node"]).contains(" run "));
     let manifest = text(&files["share/p/package.xml"]);
-    let document = roxmltree::Document::parse(manifest).expect("XML");
+    let document = crate::xml::parse(manifest).expect("XML");
     let of = |tag| document.descendants().find(|node| node.has_tag_name(tag)).and_then(|node| node.text());
     assert_eq!((of("name"), of("version"), of("license")), (Some("p"), Some("1.2.3"), Some("Apache-2.0")));
     assert!(of("maintainer").is_some() && of("description").is_some() && of("depend").is_none(), "{manifest}");

@@ -406,6 +406,7 @@ fn explanation() -> Explanation {
 fn status() -> Status {
     Status {
         version: "0.1.0".into(),
+        architecture: "x86_64".into(),
         pid: 1,
         home: "/h".into(),
         listen: "127.0.0.1:9090".into(),

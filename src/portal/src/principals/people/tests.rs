@@ -212,7 +212,7 @@ fn names_that_nobody_has_make_nothing_of_an_accounts_forgotten_and_slow_no_other
         let principals = &world.principals;
         principals.record_wrong_password("alice", from(number), 5_000);
     }
-    for number in 0..access::guesses::REMEMBERED as u32 + 100 {
+    for number in 0..access::guesses::MAX_ENTRIES as u32 + 100 {
         let name = format!("nobody{number}");
         let principals = &world.principals;
         principals.record_wrong_password(&name, from(1_000 + number), 5_001);

@@ -8,7 +8,7 @@ use super::*;
 use crate::memory_bus::{MemoryBus, MemorySystem};
 
 const HOUR: i64 = 3600 * 1_000_000_000;
-const SIMULATED: &str = "use_sim_time";
+const SIM_TIME: &str = "use_sim_time";
 
 struct SilentService;
 
@@ -20,7 +20,7 @@ impl ServiceHandler for SilentService {
 }
 
 async fn set_sim_time(bus: &MemoryBus, simulated: bool) {
-    let change = (SIMULATED.to_owned(), Some(ParamValue::Bool(simulated)));
+    let change = (SIM_TIME.to_owned(), Some(ParamValue::Bool(simulated)));
     let set = bus.set(bus.node(), vec![change]).await;
     assert_eq!(set.expect("it is there"), [Ok(())]);
 }
@@ -84,7 +84,7 @@ async fn the_parameter_server_simulates_the_time_of_all_but_no_kept_stamp_is_cha
     }
     wait_shifts(&hub, [false, true]).await;
     for (simulated, wanted) in [(true, [false, false]), (false, [false, true])] {
-        let change = (format!("/{SIMULATED}"), Some(ParamValue::Bool(simulated)));
+        let change = (format!("/{SIM_TIME}"), Some(ParamValue::Bool(simulated)));
         hub.own_view.parameters.apply_changes(&hub, vec![change]).await;
         wait_shifts(&hub, wanted).await;
     }

@@ -12,9 +12,9 @@ use super::GoalLimits;
 use crate::actions::messages::{ActionlibStatus, GoalId, GoalState};
 
 /// Time for which an ended goal stays in the status list, as in actionlib.
-const REMEMBERED: Duration = Duration::from_secs(5);
+const ENDED_GOAL_EXPIRY: Duration = Duration::from_secs(5);
 
-/// What becomes of a goal that arrives.
+/// Outcome of the arrival of a goal.
 pub(super) enum Received {
     /// It is pending.
     Begun,
@@ -163,7 +163,7 @@ impl GoalTable {
 
     /// Forgets the goals that ended some time ago; returns the states of the others.
     pub(super) fn states(&mut self) -> Vec<GoalState> {
-        self.goals.retain(|_, goal| goal.ended.is_none_or(|ended| ended.elapsed() < REMEMBERED));
+        self.goals.retain(|_, goal| goal.ended.is_none_or(|ended| ended.elapsed() < ENDED_GOAL_EXPIRY));
         self.goals.values().map(|goal| goal.state.clone()).collect()
     }
 

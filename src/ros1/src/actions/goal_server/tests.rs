@@ -67,7 +67,7 @@ impl Server {
     }
 
     /// Returns what was published since the last call.
-    fn published(&self) -> Vec<Published> {
+    fn take_published(&self) -> Vec<Published> {
         std::mem::take(&mut *self.topics.0.lock())
     }
 
@@ -81,7 +81,7 @@ impl Server {
     }
 }
 
-/// What happens to a goal.
+/// An event of a goal.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Accept,
@@ -141,7 +141,7 @@ fn goals_take_the_states_of_actionlib() {
 fn a_result_comes_before_the_status_that_lists_it_and_feedback_after_acceptance() {
     let server = server();
     server.send("one", 1);
-    assert_eq!(server.published(), [], "who executes it decides first");
+    assert_eq!(server.take_published(), [], "who executes it decides first");
     assert!(server.publish_feedback("one", &[0; 4]));
     assert!(server.end("one", GoalOutcome::Succeeded));
     let one = |status| ("one".to_owned(), status);
@@ -151,10 +151,10 @@ fn a_result_comes_before_the_status_that_lists_it_and_feedback_after_acceptance(
         Published::Result("one".to_owned(), Succeeded, "why".to_owned()),
         Published::Status(vec![one(Succeeded)]),
     ];
-    assert_eq!(server.published(), expected);
+    assert_eq!(server.take_published(), expected);
     assert!(!server.publish_feedback("one", &[0; 4]) && !server.end("one", GoalOutcome::Aborted));
     assert!(!server.publish_feedback("two", &[0; 4]) && !server.end("two", GoalOutcome::Aborted));
-    assert_eq!(server.published(), []);
+    assert_eq!(server.take_published(), []);
 }
 
 #[test]
@@ -182,10 +182,10 @@ fn a_cancel_that_overtakes_its_goal_recalls_it() {
     let server = server();
     server.cancel_goal("early", 0);
     assert_eq!(server.status("early"), Some(Recalling));
-    server.published();
+    server.take_published();
     assert_eq!(server.send("early", 9), None);
     let words = "the goal was cancelled before it came".to_owned();
-    assert_eq!(server.published()[0], Published::Result("early".to_owned(), Recalled, words));
+    assert_eq!(server.take_published()[0], Published::Result("early".to_owned(), Recalled, words));
     // By stamp.
     server.cancel_goal("", 5);
     assert_eq!(server.send("old", 5), None);
@@ -200,9 +200,9 @@ async fn ended_goals_are_listed_for_a_while_and_their_ids_are_taken_until_then()
     server.send("one", 1);
     assert_eq!(server.send("one", 1), None, "it is under way");
     server.end("one", GoalOutcome::Succeeded);
-    server.published();
+    server.take_published();
     assert_eq!(server.send("one", 1), None);
-    assert_eq!(server.published(), [], "it is ignored, as by actionlib");
+    assert_eq!(server.take_published(), [], "it is ignored, as by actionlib");
     advance(Duration::from_secs(6)).await;
     assert_eq!(server.status("one"), None);
     assert_eq!(server.send("one", 1).as_deref(), Some("one"));
@@ -223,7 +223,7 @@ fn senders_cannot_have_a_server_hold_goals_without_end() {
     for (number, expected) in [true, true, false].into_iter().enumerate() {
         assert_eq!(server.send(&format!("{number}"), 1).is_some(), expected, "{number}");
     }
-    match &server.published()[..] {
+    match &server.take_published()[..] {
         [Published::Result(id, Rejected, text), Published::Status(_)] => {
             assert!(id == "2" && text.contains("the robot"), "{id} {text}");
         }
@@ -237,21 +237,53 @@ fn senders_cannot_have_a_server_hold_goals_without_end() {
         assert_eq!(server.send(&format!("{number}"), 1).is_some(), number < 3);
         server.cancel_goal(&format!("unknown {number}"), 0);
     }
-    match server.published().last() {
+    server.publish_status();
+    match server.take_published().last() {
         Some(Published::Status(all)) => assert_eq!(all.len(), 3 + 3),
         other => panic!("{other:?}"),
     }
     let text = "3 goals of this server are under way already";
     let longest = "i".repeat(LONGEST_ID);
     server.end("0", GoalOutcome::Succeeded);
-    server.published();
+    server.take_published();
     assert_eq!(server.send(&format!("{longest}i"), 1), None);
-    assert_eq!(server.published(), [], "each status would repeat it");
+    assert_eq!(server.take_published(), [], "each status would repeat it");
     assert_eq!(server.send(&longest, 1), Some(longest));
     server.send("late", 1);
-    match &server.published()[0] {
+    match &server.take_published()[0] {
         Published::Result(_, Rejected, found) => assert!(found.starts_with(text), "{found}"),
         other => panic!("{other:?}"),
     }
     assert_eq!(server.begin(&Bytes::from_static(b"no goal")), None);
+}
+
+#[tokio::test(start_paused = true)]
+async fn statuses_are_published_at_a_bounded_rate_whatever_is_sent() {
+    let server = server();
+    let count = || server.take_published().iter().filter(|it| matches!(it, Published::Status(_))).count();
+    let results = |published: &[Published]| published.iter().filter(|it| matches!(it, Published::Result(..))).count();
+    for number in 0..3 {
+        server.send(&format!("taken {number}"), 1);
+    }
+    for round in 0..2 {
+        for number in 0..1000 {
+            server.send(&format!("{round} {number}"), 1);
+        }
+        let published = server.take_published();
+        assert_eq!(results(&published), 1000, "each is told that it was rejected");
+        let most = usize::try_from(MOST_AT_CHANGES).expect("few");
+        assert_eq!(published.len() - results(&published), most);
+        (0..1000).for_each(|_| drop(server.cancel_goal("unknown", 0)));
+        server.accept("taken 0");
+        assert_eq!(count(), 0);
+        // The next periodic one has what was left out.
+        server.publish_status();
+        match &server.take_published()[..] {
+            [Published::Status(all)] => assert!(all.contains(&("taken 0".to_owned(), Active)), "{all:?}"),
+            other => panic!("{other:?}"),
+        }
+        advance(STATUS_PERIOD).await;
+    }
+    server.end("taken 0", GoalOutcome::Succeeded);
+    assert_eq!(count(), 1);
 }

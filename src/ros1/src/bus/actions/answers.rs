@@ -9,12 +9,12 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{sleep, timeout};
 
-use crate::bus::{Ros1BusState, heard};
+use crate::bus::{Ros1BusState, bus_info};
 
 /// The topics on which a server responds; its status is received before anything is sent to it.
 const PARTS: [&str; 2] = ["feedback", "result"];
 /// Time after which a server is assumed to send to us although it does not report so: not all nodes report correctly.
-const GIVES_UP: Duration = Duration::from_secs(3);
+const CONNECTION_TIMEOUT: Duration = Duration::from_secs(3);
 /// First pause between two queries; each is twice as long as the one before.
 const PAUSE: Duration = Duration::from_millis(2);
 const LONGEST_PAUSE: Duration = Duration::from_millis(100);
@@ -38,7 +38,7 @@ impl KnownResponders {
     pub(super) async fn wait_until_connected(&self, bus: &Arc<Ros1BusState>, action: &str) {
         for part in PARTS {
             let topic = format!("{action}/{part}");
-            if timeout(GIVES_UP, self.wait_for_publishers(bus, &topic)).await.is_err() {
+            if timeout(CONNECTION_TIMEOUT, self.wait_for_publishers(bus, &topic)).await.is_err() {
                 let silent = self.unknown_publishers(bus, &topic);
                 let nodes: Vec<_> = silent.iter().map(|publisher| &publisher.node).collect();
                 tracing::debug!(topic, ?nodes, "they do not say that they send to us");
@@ -55,7 +55,7 @@ impl KnownResponders {
                 return;
             }
             // A node that cannot be queried is gone, or about to be.
-            let Ok(connections) = heard::connections(bus, topic).await else {
+            let Ok(connections) = bus_info::connections(bus, topic).await else {
                 return;
             };
             let sends = |by: &ActionPublisher| connections.iter().any(|peer| peer.node() == by.node);

@@ -35,7 +35,7 @@ struct ActionServerPublishers {
     result: Box<dyn Publisher>,
 }
 
-/// Nothing is published before the topics are open.
+/// Publishes nothing before the topics are open.
 impl GoalServerTopics for OnceLock<ActionServerPublishers> {
     fn publish_status(&self, message: Bytes) {
         if let Some(ends) = self.get() {
@@ -99,6 +99,13 @@ impl Drop for Ros1ActionServer {
 }
 
 impl ActionServer for Ros1ActionServer {
+    /// Does nothing: a goal that waits is pending already.
+    fn accept_goal(&self, _id: &str) {}
+
+    fn execute_goal(&self, id: &str) {
+        self.shared.goals.accept(id);
+    }
+
     fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
         self.shared.goals.publish_feedback(id, &feedback)
     }
@@ -145,6 +152,7 @@ impl ActionlibServerState {
             return;
         };
         match self.handler.on_goal(&id, goal) {
+            Ok(()) if self.handler.is_answer_deferred() => self.goals.announce_status(),
             Ok(()) => self.goals.accept(&id),
             Err(reason) => {
                 self.goals.end_without_result(&id, GoalOutcome::Rejected, reason.into_string());

@@ -60,7 +60,7 @@ async fn no_goal_is_sent_to_a_server_that_does_not_send_its_results_here_yet() {
     let mut late = node_reporting(&master, Value::Array(Vec::new())).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    let ready = tokio::spawn(async move { client.wait_for_server(LONG).await });
+    let ready = tokio::spawn(async move { client.wait_for_server(PATIENCE).await });
     for _ in 0..3 {
         wait_until_asked(&mut late).await;
     }
@@ -80,9 +80,9 @@ async fn a_server_that_sends_its_results_here_is_asked_once() {
     let mut other = node_reporting(&master, rows).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    client.wait_for_server(LONG).await.unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
     wait_until_asked(&mut other).await;
-    client.wait_for_server(LONG).await.unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
     while let Ok((method, _)) = other.calls.try_recv() {
         assert_ne!(method, "getBusInfo");
     }
@@ -96,7 +96,7 @@ async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
     let mut other = node_reporting(&master, Value::Array(Vec::new())).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    client.wait_for_server(LONG).await.unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
     while other.calls.try_recv().is_ok() {}
     client.wait_for_server(Duration::from_secs(1)).await.unwrap();
     while let Ok((method, _)) = other.calls.try_recv() {
@@ -112,9 +112,9 @@ async fn who_only_observes_goals_is_no_server() {
     let observed = observed.await.unwrap();
     let client = one.action_client("/dig", &dig()).unwrap();
     let connected = ros_bus::wait_for_connected(observed.matched.clone(), 1);
-    tokio::time::timeout(LONG, connected).await.unwrap();
+    tokio::time::timeout(PATIENCE, connected).await.unwrap();
     let ready = client.wait_for_server(Duration::from_millis(300)).await;
     assert!(matches!(ready, Err(BusError::Timeout { .. })), "{ready:?}");
     let _server = serve_dig(&two);
-    client.wait_for_server(LONG).await.unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
 }

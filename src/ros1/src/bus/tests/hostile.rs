@@ -1,5 +1,6 @@
 //! Peers that lie, stall and break off.
 
+use budget::{Budget, WorkLimit};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 
@@ -104,7 +105,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     drop(publisher);
     // If it reads at last, it gets what is still queued, and is then disconnected.
     let mut rest = Vec::new();
-    let read = tokio::time::timeout(LONG, lazy.read_to_end(&mut rest)).await;
+    let read = tokio::time::timeout(PATIENCE, lazy.read_to_end(&mut rest)).await;
     assert!(read.is_ok() && rest.len() > 1 << 20);
     // A publisher that ends waits for such a subscriber no longer than the farewell time.
     let publisher = advertise_text(&one, "/chat", false).await;
@@ -112,7 +113,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     header.write(&mut lazy).await.unwrap();
     wait_for_subscribers(&*publisher, 2).await;
     (0..20).for_each(|_| publisher.publish(big.clone()));
-    let closed = tokio::time::timeout(LONG, one.close()).await;
+    let closed = tokio::time::timeout(PATIENCE, one.close()).await;
     assert!(closed.is_ok());
 }
 
@@ -160,7 +161,7 @@ async fn the_slave_api_answers_what_tools_ask() {
     wait_for_subscribers(&*publisher, 1).await;
     let client = XmlRpcClient::new(Arc::new(HostSockets), one.uri()).unwrap();
     let ask = async |method: &str, args: &[Value]| {
-        let answer = client.call(method, args, LONG).await.unwrap();
+        let answer = client.call(method, args, PATIENCE).await.unwrap();
         answer.as_array().unwrap().to_vec()
     };
     let caller = [Value::from("/tool")];
@@ -213,4 +214,24 @@ async fn a_graph_that_grows_without_end_is_read_seldom() {
     // If it were read after each change, that would be a thousand parts each time on average.
     let read = reading.await.unwrap() / REGISTRATIONS;
     assert!(read < REGISTRATIONS / 10, "{read} topics for each registration");
+}
+
+#[tokio::test]
+async fn what_nodes_make_the_bus_do_is_charged_to_its_servant() {
+    let master = TestMaster::start().await;
+    let limit = WorkLimit { cores: 1.0, burst: PATIENCE };
+    let servant = Budget::new("the daemon", 1 << 30).child_with_work("a servant", 1 << 30, limit);
+    let options = JoinOptions { budget: servant.clone(), ..JoinOptions::new(master.address, "/one") };
+    let bus = Ros1Bus::connect_with(Arc::new(HostSockets), options).await.unwrap();
+    let client = XmlRpcClient::new(Arc::new(HostSockets), bus.uri()).unwrap();
+    let before = servant.work_time();
+    for _ in 0..20 {
+        client.call("getBusInfo", &["/tool".into()], PATIENCE).await.unwrap();
+    }
+    let answered = servant.work_time();
+    assert!(answered > before, "{answered:?}");
+    let mut graph = bus.graph();
+    master.call("registerPublisher", &["/n", "/busy", "std_msgs/String", "http://127.0.0.1:9/"].map(Value::from)).await;
+    graph.wait_for(|graph| graph.topics.contains_key("/busy")).await.unwrap();
+    assert!(servant.work_time() > answered);
 }

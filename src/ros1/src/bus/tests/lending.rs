@@ -56,14 +56,14 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     let master = TestMaster::start().await;
     let (_keeper, shop) = open(&master).await;
     let node = join(&master, "/node").await;
-    let missing = node.call("/add", "x".into(), LONG).await.unwrap_err();
+    let missing = node.call("/add", "x".into(), PATIENCE).await.unwrap_err();
     assert!(matches!(missing, BusError::NoService(_)), "{missing}");
     let ending = shop.offers("abcd");
     let provider = node.provider("/add").await.unwrap();
     assert_eq!(provider.node, "/keeper");
     assert_eq!(provider.service_type.digest, "abcd");
-    assert_eq!(node.call("/add", "1".into(), LONG).await.unwrap(), "1");
-    let failed = node.call("/add", "fail".into(), LONG).await.unwrap_err();
+    assert_eq!(node.call("/add", "1".into(), PATIENCE).await.unwrap(), "1");
+    let failed = node.call("/add", "fail".into(), PATIENCE).await.unwrap_err();
     assert!(failed.to_string().contains("not for /node"), "{failed}");
     assert!(master.master.graph().services.is_empty());
     let asked = ("/add".to_owned(), "/node".to_owned());
@@ -73,7 +73,7 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     ending.send_replace(true);
     let typed = async |digest: &str| {
         let digest = Digest::from(digest);
-        node.call_typed("/add", &digest, "2".into(), LONG).await
+        node.call_typed("/add", &digest, "2".into(), PATIENCE).await
     };
     let other = async {
         loop {
@@ -84,7 +84,7 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
             }
         }
     };
-    let other = tokio::time::timeout(LONG, other).await.unwrap();
+    let other = tokio::time::timeout(PATIENCE, other).await.unwrap();
     assert!(matches!(other, BusError::TypeMismatch { .. }), "{other}");
     assert_eq!(typed("beef").await.unwrap(), "2");
 }
@@ -103,7 +103,7 @@ async fn what_is_registered_comes_first_and_the_lender_asks_for_itself_in_vain()
     assert!(shop.asked.lock().is_empty(), "{:?}", shop.asked);
     drop(serving);
     master.wait_until(|graph| graph.services.is_empty()).await;
-    let missing = keeper.call("/add", "x".into(), LONG).await.unwrap_err();
+    let missing = keeper.call("/add", "x".into(), PATIENCE).await.unwrap_err();
     assert!(matches!(missing, BusError::NoService(_)), "{missing}");
     assert_eq!(other.service_type("/add").await.unwrap().digest, "abcd");
     // Services looked up in vain are recorded, with the nodes that did.
@@ -157,7 +157,7 @@ async fn another_master_is_told_who_lends() {
     let master = TestMaster::start_at(again, Some(address)).await;
     let lookup = args(["/node", "/add"]);
     let found = async { while master.call("lookupService", &lookup).await.0 != 1 {} };
-    let found = tokio::time::timeout(LONG, found).await;
+    let found = tokio::time::timeout(PATIENCE, found).await;
     found.expect("the new Master should know the lender");
 }
 
@@ -167,7 +167,7 @@ async fn an_ordinary_node_is_no_lender() {
     let node = join(&master, "/node").await;
     let asked = args(["/master", "/add", "/other"]);
     let client = xmlrpc::XmlRpcClient::new(Arc::new(HostSockets), node.uri()).unwrap();
-    let answer = client.call("cloudroid.lendService", &asked, LONG).await;
+    let answer = client.call("cloudroid.lendService", &asked, PATIENCE).await;
     let answer = answer.unwrap();
     assert_eq!(answer.as_array().unwrap()[0], Value::Int(0));
 }

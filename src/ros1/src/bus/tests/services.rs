@@ -48,23 +48,23 @@ async fn calls_are_answered_or_failed_with_the_servers_words() {
     assert_eq!(one.service_type("/echo").await.unwrap(), add_type());
     for size in [0, 1, 100_000, 3_000_000] {
         let request = Bytes::from(vec![b'x'; size]);
-        let response = two.call("/echo", request.clone(), LONG).await.unwrap();
+        let response = two.call("/echo", request.clone(), PATIENCE).await.unwrap();
         assert_eq!(response, request);
     }
-    let failed = two.call("/echo", "fail".into(), LONG).await.unwrap_err();
+    let failed = two.call("/echo", "fail".into(), PATIENCE).await.unwrap_err();
     assert!(failed.to_string().contains("not for /two"), "{failed}");
     // The connection is still good for the next call.
-    assert_eq!(two.call("/echo", "ok".into(), LONG).await.unwrap(), "ok");
-    assert_eq!(one.call("/echo", "self".into(), LONG).await.unwrap(), "self");
+    assert_eq!(two.call("/echo", "ok".into(), PATIENCE).await.unwrap(), "ok");
+    assert_eq!(one.call("/echo", "self".into(), PATIENCE).await.unwrap(), "self");
     let taken = one.serve("/echo", add_type(), Arc::new(Echo { meeting: Barrier::new(1) }));
     assert!(matches!(taken.await, Err(BusError::AlreadyServed(_))));
     drop(guard);
     master.wait_until(|graph| graph.services.is_empty()).await;
-    let gone = two.call("/echo", "x".into(), LONG).await.unwrap_err();
+    let gone = two.call("/echo", "x".into(), PATIENCE).await.unwrap_err();
     assert!(matches!(gone, BusError::NoService(_)), "{gone}");
     // And served again.
     let _guard = serve(&one).await;
-    assert_eq!(two.call("/echo", "back".into(), LONG).await.unwrap(), "back");
+    assert_eq!(two.call("/echo", "back".into(), PATIENCE).await.unwrap(), "back");
 }
 
 #[tokio::test]
@@ -72,14 +72,14 @@ async fn calls_run_at_the_same_time_and_end_in_time() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let _guard = serve(&one).await;
-    let meet = || two.call("/echo", "meet".into(), LONG);
+    let meet = || two.call("/echo", "meet".into(), PATIENCE);
     let (first, second) = tokio::join!(meet(), meet());
     assert!(first.is_ok() && second.is_ok());
     let short = Duration::from_millis(50);
     let late = two.call("/echo", "wait".into(), short).await.unwrap_err();
     assert!(matches!(late, BusError::Timeout { .. }), "{late}");
     // A late answer is not mistaken for the next call's.
-    assert_eq!(two.call("/echo", "next".into(), LONG).await.unwrap(), "next");
+    assert_eq!(two.call("/echo", "next".into(), PATIENCE).await.unwrap(), "next");
 }
 
 /// A hand-made server: each connection is answered by the next of `scripts`.
@@ -151,7 +151,7 @@ async fn a_kept_connection_that_was_closed_is_replaced_unnoticed() {
     let scripts = scripts.collect();
     let (_node, taken) = scripted_server(&master, scripts).await;
     for _ in 0..20 {
-        assert_eq!(one.call("/echo", "x".into(), LONG).await.unwrap(), "ok");
+        assert_eq!(one.call("/echo", "x".into(), PATIENCE).await.unwrap(), "ok");
     }
     assert_eq!(taken.load(Ordering::Relaxed), 20);
 }
@@ -162,7 +162,7 @@ async fn a_call_that_was_taken_is_not_made_twice() {
     let one = join(&master, "/one").await;
     let scripts = vec![Script::HangUp, Script::Answer(vec![OK])];
     let (_node, taken) = scripted_server(&master, scripts).await;
-    let error = one.call("/echo", "x".into(), LONG).await.unwrap_err();
+    let error = one.call("/echo", "x".into(), PATIENCE).await.unwrap_err();
     assert!(error.to_string().contains("during the call"), "{error}");
     assert_eq!(taken.load(Ordering::Relaxed), 1);
 }
@@ -179,13 +179,13 @@ async fn servers_that_misbehave_are_told_apart() {
     ];
     let _server = scripted_server(&master, scripts).await;
     for wanted in ["go away", "limit", "ended inside", "failed: bad"] {
-        let error = one.call("/echo", "x".into(), LONG).await.unwrap_err();
+        let error = one.call("/echo", "x".into(), PATIENCE).await.unwrap_err();
         assert!(error.to_string().contains(wanted), "{wanted}: {error}");
     }
     // A server that is registered but not running.
     let list = ["/server", "/gone", "rosrpc://127.0.0.1:1", "http://127.0.0.1:1/"].map(Value::from);
     master.call("registerService", &list).await;
-    let error = one.call("/gone", "x".into(), LONG).await.unwrap_err();
+    let error = one.call("/gone", "x".into(), PATIENCE).await.unwrap_err();
     assert!(error.to_string().contains("refused"), "{error}");
 }
 
@@ -212,7 +212,7 @@ async fn callers_that_misbehave_are_refused_and_harm_nobody() {
         let _ = tokio::io::AsyncReadExt::read_to_end(&mut stream, &mut answer).await;
         assert_eq!(answer, b"");
     }
-    assert_eq!(two.call("/echo", "fine".into(), LONG).await.unwrap(), "fine");
+    assert_eq!(two.call("/echo", "fine".into(), PATIENCE).await.unwrap(), "fine");
 }
 
 #[tokio::test]
@@ -230,7 +230,7 @@ async fn two_that_serve_one_service_do_not_fight_for_it_for_ever() {
     let changes = generation() - before;
     assert!(changes < 60, "{changes} changes");
     let three = join(&master, "/three").await;
-    assert_eq!(three.call("/echo", "x".into(), LONG).await.unwrap(), "x");
+    assert_eq!(three.call("/echo", "x".into(), PATIENCE).await.unwrap(), "x");
     // The remaining one gets it at once.
     let (gone, left) = match one.graph().borrow().services["/echo"].as_str() {
         "/one" => (first, "/two"),

@@ -102,7 +102,7 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
             tokio::task::yield_now().await;
         }
     };
-    tokio::time::timeout(LONG, released).await.unwrap();
+    tokio::time::timeout(PATIENCE, released).await.unwrap();
     let mut last = subscribe_text(&three, "/tf_static").await;
     assert_eq!(next(&mut last.messages).await.publisher.node(), "/one");
     assert!(last.messages.is_empty());
@@ -266,17 +266,17 @@ async fn whoever_was_asked_for_its_type_stays_for_what_is_advertised_next() {
     drop(asking);
     // Queried again, it answers again.
     let mut asking = publications::ask_subscribers(&one.inner, "/chat");
-    let again = tokio::time::timeout(LONG, asking.answers.recv()).await;
+    let again = tokio::time::timeout(PATIENCE, asking.answers.recv()).await;
     assert_eq!(again.expect("soon").expect("asked").digest.as_str(), "992c");
     drop(asking);
     let publisher = advertise_text(&one, "/chat", false).await;
     let mut buffer = BytesMut::new();
-    let answer = tokio::time::timeout(LONG, Header::read(&mut asked, &mut buffer)).await;
+    let answer = tokio::time::timeout(PATIENCE, Header::read(&mut asked, &mut buffer)).await;
     let answer = answer.expect("kept waiting").expect("not sent away");
     assert_eq!(answer.get("callerid"), Some("/one"), "{answer:?}");
     let mut matched = publisher.matched_subscribers();
     let hears = matched.wait_for(|matched| matched.has_node("/asked"));
-    assert!(tokio::time::timeout(LONG, hears).await.is_ok());
+    assert!(tokio::time::timeout(PATIENCE, hears).await.is_ok());
 }
 
 #[tokio::test]

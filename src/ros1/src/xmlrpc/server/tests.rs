@@ -6,7 +6,7 @@ use tokio::io::AsyncReadExt as _;
 use super::*;
 use crate::xmlrpc::{Error, XmlRpcClient, print_call};
 
-const LONG: Duration = Duration::from_secs(120);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Answers `echo` with its arguments, `wait` never, anything else with a fault.
 struct Echo;
@@ -41,7 +41,7 @@ async fn start(limits: ServerLimits) -> Running {
 }
 
 fn small() -> ServerLimits {
-    ServerLimits { body: 10_000, transfer: LONG, ..ServerLimits::default() }
+    ServerLimits { body: 10_000, transfer: PATIENCE, ..ServerLimits::default() }
 }
 
 fn client(address: SocketAddr) -> XmlRpcClient {
@@ -68,10 +68,10 @@ async fn calls_are_answered_and_faults_told() {
     let server = start(ServerLimits::default()).await;
     let client = client(server.address);
     for n in 0..3 {
-        let answer = client.call("echo", &[Value::Int(n)], LONG).await.unwrap();
+        let answer = client.call("echo", &[Value::Int(n)], PATIENCE).await.unwrap();
         assert_eq!(answer, Value::Array(vec![Value::Int(n)]));
     }
-    let fault = client.call("sing", &[], LONG).await.unwrap_err();
+    let fault = client.call("sing", &[], PATIENCE).await.unwrap_err();
     assert!(fault.to_string().contains("no sing here"), "{fault}");
 }
 
@@ -81,9 +81,9 @@ async fn a_long_call_does_not_hold_up_others() {
     let client = Arc::new(client(server.address));
     let waiting = {
         let client = client.clone();
-        tokio::spawn(async move { client.call("wait", &[], LONG).await })
+        tokio::spawn(async move { client.call("wait", &[], PATIENCE).await })
     };
-    client.call("echo", &[], LONG).await.unwrap();
+    client.call("echo", &[], PATIENCE).await.unwrap();
     waiting.abort();
 }
 
@@ -148,7 +148,7 @@ async fn bad_requests_are_refused_with_a_reason() {
     }
     // None of them has harmed the server.
     let client = client(server.address);
-    client.call("echo", &[], LONG).await.unwrap();
+    client.call("echo", &[], PATIENCE).await.unwrap();
 }
 
 #[tokio::test]
@@ -170,12 +170,12 @@ async fn connections_beyond_the_limit_wait_their_turn() {
     let limits = ServerLimits { connections: 1, ..ServerLimits::default() };
     let server = start(limits).await;
     let first = client(server.address);
-    first.call("echo", &[], LONG).await.unwrap();
+    first.call("echo", &[], PATIENCE).await.unwrap();
     let second = client(server.address);
     let late = second.call("echo", &[], Duration::from_millis(100)).await;
     assert!(matches!(late, Err(Error::Timeout { .. })));
     drop(first);
-    second.call("echo", &[], LONG).await.unwrap();
+    second.call("echo", &[], PATIENCE).await.unwrap();
 }
 
 /// A server that answers the first request on each connection, promises to keep it, and closes it all the same.
@@ -193,7 +193,7 @@ async fn the_client_survives_a_connection_closed_between_calls() {
     });
     let client = client(address);
     for _ in 0..20 {
-        client.call("echo", &[], LONG).await.unwrap();
+        client.call("echo", &[], PATIENCE).await.unwrap();
     }
     task.abort();
 }
@@ -223,7 +223,7 @@ async fn the_client_names_what_the_server_does_wrong() {
         ("HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>", "malformed"),
     ] {
         let address = fixed_server(answer).await;
-        let error = client(address).call("echo", &[], LONG).await.unwrap_err();
+        let error = client(address).call("echo", &[], PATIENCE).await.unwrap_err();
         assert!(error.to_string().contains(wanted), "{answer}: {error}");
     }
     // Without a length, the answer ends with the connection.
@@ -232,7 +232,7 @@ async fn the_client_names_what_the_server_does_wrong() {
          <methodResponse><params><param><value>x</value></param></params></methodResponse>",
     )
     .await;
-    let answer = client(address).call("echo", &[], LONG).await.unwrap();
+    let answer = client(address).call("echo", &[], PATIENCE).await.unwrap();
     assert_eq!(answer, "x".into());
 }
 
@@ -249,10 +249,10 @@ async fn an_answer_is_read_if_what_it_becomes_has_room() {
     };
     let budget = Budget::new("node x", 4 << 20);
     let few = client(fixed_server(answer(2_000)).await).with_budget(&budget);
-    assert!(few.call("echo", &[], LONG).await.is_ok());
+    assert!(few.call("echo", &[], PATIENCE).await.is_ok());
     // 640 KB of text.
     let many = client(fixed_server(answer(10_000)).await).with_budget(&budget);
-    let error = many.call("echo", &[], LONG).await.expect_err("no room");
+    let error = many.call("echo", &[], PATIENCE).await.expect_err("no room");
     assert!(error.to_string().contains("memory for node x"), "{error}");
     assert_eq!(budget.used_bytes(), 0);
 }

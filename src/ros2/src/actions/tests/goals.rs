@@ -138,6 +138,39 @@ async fn a_goal_that_is_not_taken_was_rejected() {
 }
 
 #[tokio::test]
+async fn a_goal_may_be_accepted_or_rejected_later() {
+    let (one, two) = (join(85, "/one").await, join(85, "/two").await);
+    let (handler, mut heard) = Handler::deferring();
+    let server = two.serve_action("/fib", &fibonacci(), handler).unwrap();
+    let client = client(&one).await;
+    let rejected = async |told: &mut UnboundedReceiver<Told>| match next(told).await {
+        Told::Ended(Ok(end)) => assert_eq!(end.outcome, GoalOutcome::Rejected),
+        other => panic!("{other:?}"),
+    };
+    let mut told = send(&*client, "rejected");
+    let id = next_goal_id(&mut heard).await;
+    assert!(server.end_goal(&id, end(GoalOutcome::Rejected, Bytes::new())));
+    rejected(&mut told).await;
+    assert!(!server.end_goal(&id, end(GoalOutcome::Succeeded, sequence("[0]"))), "it is forgotten");
+    // One that waits first, and one that ends before it is accepted.
+    let succeeded = || end(GoalOutcome::Succeeded, sequence("[0]"));
+    let mut told = send(&*client, "accepted");
+    let id = next_goal_id(&mut heard).await;
+    server.accept_goal(&id);
+    server.execute_goal(&id);
+    assert!(server.end_goal(&id, succeeded()));
+    assert_eq!(next(&mut told).await, Told::Ended(Ok(succeeded())));
+    let mut told = send(&*client, "ended");
+    let id = next_goal_id(&mut heard).await;
+    assert!(server.end_goal(&id, succeeded()));
+    assert_eq!(next(&mut told).await, Told::Ended(Ok(succeeded())));
+    let mut told = send(&*client, "left");
+    next_goal_id(&mut heard).await;
+    drop(server);
+    rejected(&mut told).await;
+}
+
+#[tokio::test]
 async fn who_drops_its_client_has_its_goals_cancelled() {
     let (one, two) = (join(74, "/one").await, join(74, "/two").await);
     let (_server, mut heard) = serve(&two, true);

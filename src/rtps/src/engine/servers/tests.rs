@@ -92,6 +92,20 @@ impl ClientWorld {
         self.client.receive(self.now, HERE, &writer.finish().into());
     }
 
+    /// Has a reader of another participant acknowledge that it knows our writer.
+    fn confirm_match(&mut self, ours: Guid, theirs: &EndpointData, count: u32) {
+        let acknack = wire::AckNack {
+            reader: theirs.guid.entity,
+            writer: ours.entity,
+            set: SequenceSet::empty(SequenceNumber(1)),
+            count,
+            is_final: true,
+        };
+        self.deliver(theirs.guid.prefix, |out| {
+            out.acknack(&acknack);
+        });
+    }
+
     fn knows(&self, prefix: GuidPrefix) -> bool {
         let discovered = self.client.watch_discovered();
         let discovered = discovered.borrow();
@@ -311,10 +325,11 @@ fn a_restarted_server_is_sent_everything_again() {
     let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
     let mut server = FakeServer::new(0);
     server.announce_itself(&mut world);
-    let (_, ends) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
+    let (ours, ends) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
     server.send_participant(&mut world, 2, &participant(OTHER, 7412));
-    let end = reader(OTHER).to_bytes();
-    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
+    let theirs = reader(OTHER);
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, theirs.to_bytes());
+    world.confirm_match(ours, &theirs, 1);
     world.advance(SECOND);
     let (writer, reader) = ANNOUNCERS[0];
     server.acknowledge(&mut world, writer, reader, 2);
@@ -367,16 +382,7 @@ fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
     let mut count = 0;
     let mut answer = |world: &mut ClientWorld| {
         count += 1;
-        let acknack = wire::AckNack {
-            reader: theirs.guid.entity,
-            writer: ours.entity,
-            set: SequenceSet::empty(SequenceNumber(1)),
-            count,
-            is_final: true,
-        };
-        world.deliver(OTHER, |out| {
-            out.acknack(&acknack);
-        });
+        world.confirm_match(ours, &theirs, count);
     };
     // As long as it answers it is alive, whatever happens to the server.
     answer(&mut world);
@@ -401,6 +407,39 @@ fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
     assert!(world.knows(OTHER), "a server would have said so first: its lease is 20 s");
     world.advance(20 * SECOND);
     assert!(!world.knows(OTHER));
+}
+
+#[test]
+fn an_endpoint_is_announced_again_until_the_other_side_knows_it() {
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
+    let (ours, _) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
+    let mut server = FakeServer::new(0);
+    server.announce_itself(&mut world);
+    let (writer, reader_of_it) = ANNOUNCERS[0];
+    // The server acknowledges whatever it is told, and forwards nothing.
+    let mut told = Vec::new();
+    let mut serve = |world: &mut ClientWorld, server: &mut FakeServer, duration: u32| {
+        let before = told.len();
+        for _ in 0..duration * 4 {
+            let said = collect_announcements(&world.advance(SECOND / 4));
+            told.extend(said.into_iter().filter(|(who, ..)| *who == writer).map(|(_, number, _)| number));
+            let next = told.iter().max().map_or(1, |number| number + 1);
+            server.acknowledge(world, writer, reader_of_it, next);
+        }
+        told[before..].to_vec()
+    };
+    assert_eq!(serve(&mut world, &mut server, 8), [1], "nobody has such a topic");
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
+    let theirs = reader(OTHER);
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, theirs.to_bytes());
+    let again = serve(&mut world, &mut server, 16);
+    assert!((2..=4).contains(&again.len()) && again.is_sorted(), "{again:?}");
+    // A server of Fast DDS compares the bytes, and ignores what is the same; others read the same.
+    let repeated = theirs.to_bytes_again(1);
+    assert!(repeated != theirs.to_bytes() && repeated != theirs.to_bytes_again(2));
+    assert_eq!(EndpointData::from_payload(&repeated).expect("an endpoint"), theirs);
+    world.confirm_match(ours, &theirs, 1);
+    assert_eq!(serve(&mut world, &mut server, 64), [], "it has confirmed the match");
 }
 
 #[test]

@@ -1,14 +1,16 @@
 //! A client with the robot's type of an action of the servant.
 //!
 //! Goals are sent in order, once a server is there: one that is sent before its server listens is lost in ROS 1, and a
-//! client that sends a newer goal relies on the order.
+//! client that sends a newer goal relies on the order. What waits is bounded by number and charged to the robot.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::{Budget, Exceeded, Permit};
 use bytes::Bytes;
+use parking_lot::Mutex;
 use ros::bus::{ActionClient, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 use ros::codec::default_message;
 use ros::schema::MessageType;
@@ -16,17 +18,27 @@ use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use crate::bus::state::Translation;
-use crate::{ActionTwin, MessageTranslator};
+use crate::{ActionTwin, MessageTranslator, TranslationError};
 
 /// Time for which goals wait for a server that the graph shows.
 const CONNECTS: Duration = Duration::from_secs(10);
+
+/// Maximum number of goals and cancels that wait to be carried out. Those in front of the client hold fewer goals, and
+/// of each only one cancel waits.
+const MOST_ORDERS: usize = 2048;
 
 /// A client of one action. Goals that are under way when it is dropped are cancelled.
 pub(crate) struct TranslatedActionClient {
     carrier: Arc<ActionCarrier>,
     inner: Arc<dyn ActionClient>,
-    orders: mpsc::UnboundedSender<Order>,
+    /// Budget for goals that wait.
+    budget: Budget,
+    orders: mpsc::Sender<Order>,
+    cancels: WaitingCancels,
 }
+
+/// Ids of the goals whose cancels wait.
+type WaitingCancels = Arc<Mutex<BTreeSet<String>>>;
 
 /// Translates the messages of one action.
 pub(super) struct ActionCarrier {
@@ -52,7 +64,7 @@ impl ActionCarrier {
     }
 }
 
-/// What is to be done in order.
+/// Operations that are carried out in order.
 enum Order {
     Send(WaitingGoal),
     Cancel(String),
@@ -63,23 +75,52 @@ struct WaitingGoal {
     id: String,
     goal: Bytes,
     events: Arc<TranslatedEvents>,
+    /// Held until it is sent.
+    _held: Permit,
 }
 
 impl TranslatedActionClient {
-    /// Opens a client of the servant's action. Call it within a Tokio runtime.
-    pub(super) fn open(translation: &Arc<Translation>, action: &str, twin: &Arc<ActionTwin>) -> Result<Self, BusError> {
+    /// Opens a client of the servant's action; goals that wait are charged to `budget`. Call it within a Tokio runtime.
+    pub(super) fn open(
+        translation: &Arc<Translation>,
+        action: &str,
+        twin: &Arc<ActionTwin>,
+        budget: &Budget,
+    ) -> Result<Self, BusError> {
         let inner: Arc<dyn ActionClient> = Arc::from(translation.inner.action_client(action, &twin.original)?);
         let carrier =
             ActionCarrier { translation: Arc::clone(translation), action: action.to_owned(), twin: Arc::clone(twin) };
-        Ok(Self::with_client(carrier, inner))
+        let (orders, ordered) = mpsc::channel(MOST_ORDERS);
+        let cancels = WaitingCancels::default();
+        // It ends with the sender of the orders.
+        let carrying = carry_out(carrier.action.clone(), Arc::clone(&inner), ordered, Arc::clone(&cancels));
+        tokio::spawn(carrying.in_current_span());
+        Ok(Self { carrier: Arc::new(carrier), inner, budget: budget.clone(), orders, cancels })
     }
 
-    fn with_client(carrier: ActionCarrier, inner: Arc<dyn ActionClient>) -> Self {
-        let (orders, ordered) = mpsc::unbounded_channel();
-        // It ends with the sender of the orders.
-        tokio::spawn(carry_out(carrier.action.clone(), Arc::clone(&inner), ordered).in_current_span());
-        Self { carrier: Arc::new(carrier), inner, orders }
+    /// Lets a goal of the robot's type wait for its turn.
+    fn queue_goal(&self, id: &str, goal: &[u8], events: &Arc<TranslatedEvents>) -> Result<(), UnsentGoal> {
+        let ActionCarrier { translation, action, twin } = &*self.carrier;
+        let goal = translation.losses.translate(action, &twin.goal.from_twin, goal)?;
+        let held = self.budget.take(size_of::<WaitingGoal>() + id.len() + goal.len())?;
+        let goal = WaitingGoal { id: id.to_owned(), goal, events: Arc::clone(events), _held: held };
+        // Received as long as this client exists.
+        self.orders.try_send(Order::Send(goal)).map_err(|_| UnsentGoal::TooMany)
     }
+}
+
+/// The reason why a goal is rejected before it is sent.
+#[derive(Debug, thiserror::Error)]
+enum UnsentGoal {
+    /// The goal is not of the action's type, or the other ROS cannot express it.
+    #[error("the goal is not carried to the other ROS: {0}")]
+    Untranslated(#[from] TranslationError),
+    /// The goal does not fit into the budget.
+    #[error(transparent)]
+    NoMemory(#[from] Exceeded),
+    /// The limit of waiting orders is reached.
+    #[error("{MOST_ORDERS} goals and cancels wait for this action already; wait for some to end")]
+    TooMany,
 }
 
 #[async_trait]
@@ -89,32 +130,36 @@ impl ActionClient for TranslatedActionClient {
     }
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        let carrier = &self.carrier;
-        let events = TranslatedEvents { carrier: Arc::clone(carrier), events };
-        let losses = &carrier.translation.losses;
-        match losses.translate(&carrier.action, &carrier.twin.goal.from_twin, &goal) {
-            Ok(goal) => {
-                let goal = WaitingGoal { id: id.to_owned(), goal, events: Arc::new(events) };
-                // Received as long as this client exists.
-                let _ = self.orders.send(Order::Send(goal));
-            }
-            Err(error) => {
-                let text = format!("the goal is not carried to the other ROS: {error}");
-                events.end(GoalOutcome::Rejected, text);
-            }
+        let events = Arc::new(TranslatedEvents { carrier: Arc::clone(&self.carrier), events });
+        if let Err(reason) = self.queue_goal(id, &goal, &events) {
+            events.end(GoalOutcome::Rejected, reason.to_string());
         }
     }
 
     fn cancel_goal(&self, id: &str) {
-        let _ = self.orders.send(Order::Cancel(id.to_owned()));
+        // One that waits says it all.
+        if self.cancels.lock().insert(id.to_owned()) && self.orders.try_send(Order::Cancel(id.to_owned())).is_err() {
+            self.cancels.lock().remove(id);
+        }
     }
 }
 
 /// Sends and cancels goals in order until their client is dropped.
-async fn carry_out(action: String, inner: Arc<dyn ActionClient>, mut orders: mpsc::UnboundedReceiver<Order>) {
+async fn carry_out(
+    action: String,
+    inner: Arc<dyn ActionClient>,
+    mut orders: mpsc::Receiver<Order>,
+    cancels: WaitingCancels,
+) {
+    let take = |order: Order, waiting: &mut VecDeque<WaitingGoal>| {
+        if let Order::Cancel(id) = &order {
+            cancels.lock().remove(id);
+        }
+        follow(order, waiting, &*inner);
+    };
     while let Some(order) = orders.recv().await {
         let mut waiting = VecDeque::new();
-        follow(order, &mut waiting, &*inner);
+        take(order, &mut waiting);
         if waiting.is_empty() {
             continue;
         }
@@ -124,7 +169,7 @@ async fn carry_out(action: String, inner: Arc<dyn ActionClient>, mut orders: mps
                 biased;
                 ready = &mut ready => break ready,
                 order = orders.recv() => match order {
-                    Some(order) => follow(order, &mut waiting, &*inner),
+                    Some(order) => take(order, &mut waiting),
                     None => break Err(BusError::Closed),
                 },
             }
@@ -133,7 +178,7 @@ async fn carry_out(action: String, inner: Arc<dyn ActionClient>, mut orders: mps
             BusError::Timeout { .. } => GoalError::NoServer(action.clone()),
             other => other.into(),
         });
-        for WaitingGoal { id, goal, events } in waiting {
+        for WaitingGoal { id, goal, events, .. } in waiting {
             match &failure {
                 None => inner.send_goal(&id, goal, events),
                 Some(error) => events.on_ended(Err(error.clone())),

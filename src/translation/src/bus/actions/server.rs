@@ -35,6 +35,14 @@ impl TranslatedActionServer {
 }
 
 impl ActionServer for TranslatedActionServer {
+    fn accept_goal(&self, id: &str) {
+        self.inner.accept_goal(id);
+    }
+
+    fn execute_goal(&self, id: &str) {
+        self.inner.execute_goal(id);
+    }
+
     fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
         let ActionCarrier { translation, action, twin } = &*self.carrier;
         match translation.losses.translate(action, &twin.feedback.from_twin, &feedback) {
@@ -64,6 +72,10 @@ impl ActionHandler for TranslatingActionHandler {
         let refused =
             |error: TranslationError| FailureReason::new(format!("the goal is not carried to the other ROS: {error}"));
         self.handler.on_goal(id, goal.map_err(refused)?)
+    }
+
+    fn is_answer_deferred(&self) -> bool {
+        self.handler.is_answer_deferred()
     }
 
     fn on_cancel(&self, id: &str) {

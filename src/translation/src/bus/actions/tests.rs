@@ -18,7 +18,7 @@ use crate::{TranslationRules, TypeTranslations};
 mod of_ros1;
 mod of_ros2;
 
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
 const DEFINITION: &str = "int32 order\n---\nint32 sum\n---\nint32 part\n";
 
 /// A goal that the servant's server was given.
@@ -40,7 +40,7 @@ struct Server {
     goals: Mutex<HashMap<String, SentGoal>>,
     cancelled: Mutex<Vec<String>>,
     changed: watch::Sender<usize>,
-    /// What the handler of a served action is.
+    /// Handler of the served action.
     handler: Mutex<Option<Arc<dyn ActionHandler>>>,
     ends: Mutex<Vec<(String, GoalEnd)>>,
 }
@@ -48,7 +48,7 @@ struct Server {
 impl Server {
     async fn wait_for(&self, is_so: impl Fn(&Self) -> bool) {
         let mut changes = self.changed.subscribe();
-        timeout(LONG, changes.wait_for(|_| is_so(self))).await.expect("it happens").expect("a sender");
+        timeout(PATIENCE, changes.wait_for(|_| is_so(self))).await.expect("it happens").expect("a sender");
     }
 
     /// Returns a goal once it was sent.
@@ -57,7 +57,7 @@ impl Server {
         self.goals.lock()[id].clone()
     }
 
-    async fn cancelled(&self, id: &str) {
+    async fn wait_cancelled(&self, id: &str) {
         self.wait_for(|server| server.cancelled.lock().iter().any(|cancelled| cancelled == id)).await;
     }
 
@@ -91,6 +91,10 @@ impl ActionClient for ServantClient {
 struct ServantServer(Arc<Server>);
 
 impl ActionServer for ServantServer {
+    fn accept_goal(&self, _id: &str) {}
+
+    fn execute_goal(&self, _id: &str) {}
+
     fn publish_feedback(&self, _id: &str, _feedback: Bytes) -> bool {
         true
     }
@@ -221,6 +225,11 @@ impl World {
 
     /// Creates a servant whose action server does not listen yet.
     fn starting(version: RosVersion) -> World {
+        World::with_budget(version, &Budget::without_limit())
+    }
+
+    /// Creates such a servant, for a robot with this budget.
+    fn with_budget(version: RosVersion, budget: &Budget) -> World {
         let definitions: BTreeMap<String, String> = [("x_msgs/action/Count".to_owned(), DEFINITION.to_owned())].into();
         let registry = Registry::with_definitions(version, &definitions).expect("definitions");
         let (server, notices) = (Arc::<Server>::default(), Arc::<Notices>::default());
@@ -228,15 +237,14 @@ impl World {
         let servant = Arc::new(Servant { version, graph: shown, server: Arc::clone(&server) });
         let types = Arc::new(TypeTranslations::new(TranslationRules::default()));
         let inner: Arc<dyn Bus> = Arc::clone(&servant) as _;
-        let bus =
-            TranslatedBus::new(inner, types, Arc::new(registry), Arc::clone(&notices) as _, &Budget::without_limit());
+        let bus = TranslatedBus::new(inner, types, Arc::new(registry), Arc::clone(&notices) as _, budget);
         World { bus, server, servant, notices }
     }
 
     /// Waits until the robot's graph has changed in this way.
     async fn wait_for_graph(&self, is_so: impl Fn(&Graph) -> bool) -> Arc<Graph> {
         let mut graphs = self.bus.graph();
-        let found = timeout(LONG, graphs.wait_for(|graph| is_so(graph))).await.expect("it changes");
+        let found = timeout(PATIENCE, graphs.wait_for(|graph| is_so(graph))).await.expect("it changes");
         Arc::clone(&found.expect("a graph"))
     }
 }

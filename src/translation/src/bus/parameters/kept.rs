@@ -9,7 +9,7 @@ use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use ros::ros1::names::canonical;
 
-use super::names::{below, join};
+use super::names::{join, strip_parent};
 use super::values::{Tree, put_at};
 
 /// Bytes charged for a parameter in addition to its key and value.
@@ -104,7 +104,7 @@ fn entries_below<'v>(values: &'v BTreeMap<String, Kept>, key: &'v str) -> impl I
     let first = join(key, "");
     let from = (Bound::Included(first.clone()), Bound::Unbounded);
     let following = values.range::<String, _>(from).take_while(move |(other, _)| other.starts_with(&first));
-    following.filter_map(move |(other, kept)| Some((below(other, key)?, kept)))
+    following.filter_map(move |(other, kept)| Some((strip_parent(other, key)?, kept)))
 }
 
 fn remove_at(values: &mut BTreeMap<String, Kept>, key: &str) -> bool {

@@ -20,11 +20,13 @@ mod tests;
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
+use ros::bus::parameter_names::spell_in_ros2;
 use ros::bus::{ParamValue, ParameterKind};
 use ros::ros2::arguments::{self, BEGIN, END, Kind};
+use ros::ros2::parameters::yaml::parse_any;
 use ros::ros2::process::yaml;
 
-use super::names::{SIM_TIME, to_name};
+use super::names::SIM_TIME;
 use super::values::{NodeValues, ParameterRefusal, Tree, check_for_ros1};
 
 /// Maximum size of one argument in bytes; Linux takes no longer ones than 128 KiB.
@@ -32,18 +34,18 @@ const MAX_ARGUMENT: usize = 100 << 10;
 /// Maximum size in bytes, and number, of all parameters on a command line.
 const MAX_PARAMETERS: (usize, usize) = (1 << 20, 2000);
 /// Maximum number of things left out that are named.
-const MAX_LEFT_OUT: usize = 20;
+const MAX_OMISSIONS: usize = 20;
 /// Maximum number of characters shown of something left out, and of the reason.
-const SHOWN: usize = 200;
+const MAX_SHOWN_LENGTH: usize = 200;
 
-/// What a node of the other ROS is started with.
+/// Arguments and parameters with which a node of the other ROS is started.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TranslatedLaunch {
-    /// Its arguments.
+    /// Arguments of the node.
     pub argv: Vec<String>,
     /// Parameters that are to stand at the Master before it starts, by key. None in ROS 2.
     pub parameters: Vec<(String, ParamValue)>,
-    /// What it is not given, with the reasons.
+    /// Parameters that are not passed on, with the reasons.
     pub left_out: LeftOutParameters,
 }
 
@@ -57,9 +59,9 @@ pub struct LeftOutParameters {
 impl LeftOutParameters {
     /// Adds a parameter.
     pub fn add(&mut self, name: &str, reason: &dyn Display) {
-        if self.named.len() < MAX_LEFT_OUT {
-            let name: String = name.chars().take(SHOWN).collect();
-            let reason: String = reason.to_string().chars().take(SHOWN).collect();
+        if self.named.len() < MAX_OMISSIONS {
+            let name: String = name.chars().take(MAX_SHOWN_LENGTH).collect();
+            let reason: String = reason.to_string().chars().take(MAX_SHOWN_LENGTH).collect();
             self.named.push(format!("{name}: {reason}"));
         } else {
             self.others += 1;
@@ -103,7 +105,7 @@ pub(super) fn for_ros2(
     let mut left_out = LeftOutParameters::default();
     let mut private_values = NodeValues::default();
     for (name, value) in private {
-        private_values.add(to_name(name), value.clone());
+        private_values.add(spell_in_ros2(name), value.clone());
     }
     for (name, refusal) in private_values.refused {
         left_out.add(&name, &refusal);
@@ -161,7 +163,8 @@ fn fit_arguments(argv: &[String], kinds: &BTreeMap<String, ParameterKind>) -> Ve
     for part in parts {
         match (&part.kind, &part.words[..]) {
             (Kind::Parameter(parameter), [flag, word]) => {
-                let fitted = kinds.get(&to_name(&parameter.name)).and_then(|kind| fit_text(&parameter.value, kind));
+                let fitted =
+                    kinds.get(&spell_in_ros2(&parameter.name)).and_then(|kind| fit_text(&parameter.value, kind));
                 let (name, _) = word.split_once(":=").unwrap_or((word.as_str(), ""));
                 let word = fitted.map_or_else(|| word.clone(), |value| format!("{name}:={value}"));
                 words.extend([flag.clone(), word]);
@@ -174,7 +177,7 @@ fn fit_arguments(argv: &[String], kinds: &BTreeMap<String, ParameterKind>) -> Ve
 
 /// Returns a value of `-p` in the type of the parameter; `None` if it need not, or cannot, be changed.
 fn fit_text(text: &str, kind: &ParameterKind) -> Option<String> {
-    let value = parse_yaml(text);
+    let value = parse_any(text);
     let is_text = matches!(value, ParamValue::String(_));
     let fitted = match kind {
         // `_name:=5` of ROS 1 is what the node reads as a text.
@@ -214,7 +217,7 @@ pub(super) fn for_ros1(node: &str, argv: &[String]) -> TranslatedLaunch {
             launch.argv.push(word.clone());
             continue;
         };
-        let value = parse_ros2_yaml(text);
+        let value = parse_any(text);
         match check_for_ros1(&value) {
             Ok(()) => drop(parameters.insert(format!("{node}/{name}"), value)),
             Err(refusal) => launch.left_out.add(name, &refusal),
@@ -222,20 +225,4 @@ pub(super) fn for_ros1(node: &str, argv: &[String]) -> TranslatedLaunch {
     }
     launch.parameters = parameters.into_iter().collect();
     launch
-}
-
-/// Parses YAML; what is none is a text, and so is nothing.
-fn parse_yaml(text: &str) -> ParamValue {
-    serde_norway::from_str(text).unwrap_or_else(|_| ParamValue::String(text.to_owned()))
-}
-
-/// Parses a value of `-p`. In rcl these words are bools, too, unless they are quoted.
-fn parse_ros2_yaml(text: &str) -> ParamValue {
-    const YES: [&str; 8] = ["y", "Y", "yes", "Yes", "YES", "on", "On", "ON"];
-    const NO: [&str; 8] = ["n", "N", "no", "No", "NO", "off", "Off", "OFF"];
-    match text.trim() {
-        word if YES.contains(&word) => ParamValue::Bool(true),
-        word if NO.contains(&word) => ParamValue::Bool(false),
-        _ => parse_yaml(text),
-    }
 }

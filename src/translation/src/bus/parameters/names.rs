@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use ros::bus::parameter_names::spell_in_ros1;
 use ros::bus::{Bus, Graph};
 use ros::ros1::xmlrpc::MAX_DEPTH;
 
@@ -16,21 +17,21 @@ const LISTS: &str = "/list_parameters";
 /// declare for topics (`qos_overrides./scan.publisher.depth`).
 pub(super) fn to_key(node: &str, parameter: &str) -> Option<String> {
     let is_carried = parameter.split('.').all(|part| !part.is_empty() && !part.contains('/'));
-    is_carried.then(|| format!("{node}/{}", parameter.replace('.', "/")))
+    is_carried.then(|| format!("{node}/{}", spell_in_ros1(parameter)))
 }
 
 /// Returns the key of a node's parameter for an error, whether or not it is a valid one.
 pub(super) fn shown_key(node: &str, parameter: &str) -> String {
-    format!("{node}/{}", parameter.replace('.', "/"))
+    format!("{node}/{}", spell_in_ros1(parameter))
 }
 
-/// Returns the name of the parameter whose key continues with `rest` after the node's name.
-pub(super) fn to_name(rest: &str) -> String {
-    rest.replace('/', ".")
+/// Returns the nodes of ROS 2 that have parameters.
+pub(super) fn node_names(graph: &Graph) -> impl Iterator<Item = &str> {
+    graph.services.keys().filter_map(|service| service.strip_suffix(LISTS))
 }
 
 /// Returns the part of `key` below `above`; `None` if it is not below it. Everything is below `/`.
-pub(super) fn below<'k>(key: &'k str, above: &str) -> Option<&'k str> {
+pub(super) fn strip_parent<'k>(key: &'k str, above: &str) -> Option<&'k str> {
     let rest = match above {
         "/" => key.strip_prefix('/')?,
         _ => key.strip_prefix(above)?.strip_prefix('/')?,
@@ -75,8 +76,10 @@ impl ParameterNodes {
 
     /// Returns the nodes whose names are `key` or below it.
     pub(super) fn at_or_below(&self, key: &str) -> Vec<String> {
-        let nodes = self.graph.services.keys().filter_map(|service| service.strip_suffix(LISTS));
-        nodes.filter(|node| *node == key || below(node, key).is_some()).map(str::to_owned).collect()
+        node_names(&self.graph)
+            .filter(|node| *node == key || strip_parent(node, key).is_some())
+            .map(str::to_owned)
+            .collect()
     }
 }
 
@@ -92,7 +95,6 @@ mod tests {
     #[test]
     fn levels_are_separated_by_dots_at_nodes_and_by_slashes_at_the_master() {
         assert_eq!(to_key("/camera/see", "gains.p").as_deref(), Some("/camera/see/gains/p"));
-        assert_eq!(to_name("gains/p"), "gains.p");
         for name in ["qos_overrides./scan.publisher.depth", "", "a..b", ".a", "a."] {
             assert_eq!(to_key("/see", name), None, "{name}");
         }
@@ -118,8 +120,11 @@ mod tests {
 
     #[test]
     fn keys_are_below_whole_parts_of_names() {
-        assert_eq!((below("/a/b", "/a"), below("/ab", "/a"), below("/a", "/a")), (Some("b"), None, None));
-        assert_eq!((below("/a", "/"), below("/", "/")), (Some("a"), None));
+        assert_eq!(
+            (strip_parent("/a/b", "/a"), strip_parent("/ab", "/a"), strip_parent("/a", "/a")),
+            (Some("b"), None, None)
+        );
+        assert_eq!((strip_parent("/a", "/"), strip_parent("/", "/")), (Some("a"), None));
         assert_eq!((join("/", "a"), join("/a", "b")), ("/a".to_owned(), "/a/b".to_owned()));
     }
 }

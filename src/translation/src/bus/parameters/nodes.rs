@@ -9,6 +9,7 @@
 //! set at their server, which applies them, and have its types and ranges.
 
 mod events;
+mod known_values;
 #[cfg(test)]
 mod tests;
 
@@ -16,6 +17,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use ros::bus::parameter_names::{spell_in_ros1, spell_in_ros2};
 use ros::bus::{
     Bus, BusError, FailureReason, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvents,
     ParameterKind, ParameterNames,
@@ -26,11 +28,12 @@ use super::names::{SIM_TIME, SIM_TIME_KEY, shown_key, to_key};
 use super::reconfigure::{Config, ReconfigureRefusal, ReconfigureServer};
 use super::values::{ParameterRefusal, Tree, check_for_ros1, value_at};
 use events::MasterWatch;
+use known_values::KnownValues;
 
 /// Maximum size of the values or descriptions of one answer, in bytes: a request may name a parameter a million times.
 const MAX_ANSWER: usize = 64 << 20;
 /// Bytes counted for each parameter of an answer beside its texts.
-const EACH: usize = 64;
+const PARAMETER_OVERHEAD: usize = 64;
 
 /// The parameters of nodes, over the Master of a ROS 1 bus.
 pub struct NodeParameterView {
@@ -54,7 +57,7 @@ enum SetRefusal {
 
 /// A checked change.
 enum PlannedChange {
-    /// Of the server of this index, by its own name.
+    /// Parameter of the server with this index, by the server's name for it.
     Reconfigure(usize, String, ParamValue),
     /// At the Master.
     Set(String, ParamValue),
@@ -74,6 +77,11 @@ impl NodeParameterView {
     /// Creates the view.
     pub fn new(inner: Arc<dyn Bus>) -> Self {
         Self { inner, watch: Mutex::default() }
+    }
+
+    /// Returns the bus of the servant.
+    pub(super) fn bus(&self) -> &Arc<dyn Bus> {
+        &self.inner
     }
 
     /// Returns the error for a node that does not exist, as a bus of ROS 2 has it.
@@ -186,7 +194,7 @@ impl NodeState {
             return Ok(PlannedChange::Reconfigure(at, own.to_owned(), described.check(&value)?));
         }
         let key = to_key(node, &name).ok_or_else(|| ParameterRefusal::Key(shown_key("~", &name)))?;
-        let path = name.replace('.', "/");
+        let path = spell_in_ros1(&name);
         let there = value_at(&self.tree, &path);
         let Some(value) = value else {
             return match there {
@@ -201,7 +209,7 @@ impl NodeState {
         let mut ends = path.match_indices('/').map(|(at, _)| &path[..at]);
         if let Some(above) = ends.find(|above| !matches!(value_at(&self.tree, above), None | Some(ParamValue::Map(_))))
         {
-            return Err(ParameterRefusal::BelowValue(above.replace('/', ".")).into());
+            return Err(ParameterRefusal::BelowValue(spell_in_ros2(above)).into());
         }
         Ok(PlannedChange::Set(key, value))
     }
@@ -210,7 +218,7 @@ impl NodeState {
 /// Returns the value of a parameter but `use_sim_time`. A dictionary is no value, but has parameters below it.
 fn find_value<'t>(tree: &'t Tree, name: &str) -> Option<&'t ParamValue> {
     to_key("", name)?;
-    let value = value_at(tree, &name.replace('.', "/"))?;
+    let value = value_at(tree, &spell_in_ros1(name))?;
     (!matches!(value, ParamValue::Map(_) | ParamValue::Nil)).then_some(value)
 }
 
@@ -226,7 +234,7 @@ impl AnswerRoom {
 
     /// Takes the room for one parameter.
     fn take(&mut self, node: &str, bytes: usize) -> Result<(), BusError> {
-        let left = self.left.checked_sub(bytes.saturating_add(EACH));
+        let left = self.left.checked_sub(bytes.saturating_add(PARAMETER_OVERHEAD));
         self.left = left.ok_or_else(|| BusError::Protocol {
             what: format!("a request for parameters of {node}"),
             reason: format!("the answer takes more than {MAX_ANSWER} bytes; ask for fewer parameters at once"),
@@ -376,14 +384,13 @@ impl NodeParameters for NodeParameterView {
             self.check_node(node)?;
         }
         let mut watch = self.watch.lock().await;
-        if let Some(running) = watch.as_ref()
-            && let Some(events) = running.subscribe(node)
-        {
+        if let Some(events) = watch.as_ref().and_then(|running| running.subscribe(node)) {
             return Ok(Box::new(events));
         }
-        // Another watcher has replaced the earlier one, or there was none.
-        let changes = self.inner.parameters()?.watch().await?;
-        let (running, events) = MasterWatch::start(changes, self.inner.graph(), node);
+        let master = self.inner.parameters()?;
+        let changes = master.watch().await?;
+        let known = KnownValues::new("/", &master.get("/").await?);
+        let (running, events) = MasterWatch::start(changes, known, self.inner.graph(), node);
         *watch = Some(running);
         Ok(Box::new(events))
     }

@@ -5,9 +5,9 @@ use std::fmt::Display;
 use ros::bus::BusError;
 
 /// Maximum number of refused parameters that an error names.
-const NAMED: usize = 5;
+const MAX_NAMED_PARAMETERS: usize = 5;
 /// Maximum number of characters of a reason, which a node may have given.
-const WORDS: usize = 200;
+const MAX_REASON_LENGTH: usize = 200;
 
 /// Refused parameters with their reasons. Only the first ones are remembered.
 #[derive(Debug, Default, PartialEq)]
@@ -19,11 +19,11 @@ pub(super) struct RefusedParameters {
 impl RefusedParameters {
     /// Adds a parameter.
     pub(super) fn add(&mut self, parameter: &str, reason: &dyn Display) {
-        if self.named.len() >= NAMED {
+        if self.named.len() >= MAX_NAMED_PARAMETERS {
             self.others += 1;
             return;
         }
-        let reason = reason.to_string().chars().take(WORDS).collect();
+        let reason = reason.to_string().chars().take(MAX_REASON_LENGTH).collect();
         self.named.push((parameter.to_owned(), reason));
     }
 

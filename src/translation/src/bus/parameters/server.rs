@@ -21,13 +21,14 @@ use async_trait::async_trait;
 use budget::Budget;
 use futures_util::{StreamExt, stream};
 use parking_lot::Mutex;
+use ros::bus::parameter_names::spell_in_ros2;
 use ros::bus::{
     Bus, BusError, FailureReason, GlobalParameters, ParamChange, ParamChangeReceiver, ParamValue, param_change_channel,
 };
 use ros::ros1::names::canonical;
 
 use super::kept::KeptParameters;
-use super::names::{ParameterNodes, SIM_TIME, SIM_TIME_KEY, below, join, shown_key, to_key, to_name};
+use super::names::{ParameterNodes, SIM_TIME, SIM_TIME_KEY, join, shown_key, strip_parent, to_key};
 use super::refusals::RefusedParameters;
 use super::values::{NodeValues, ParameterRefusal, Tree, check_for_ros1, is_too_deep, put_at, value_at};
 use changes::Watcher;
@@ -47,7 +48,7 @@ pub struct ParameterServerView {
     watcher: Arc<Mutex<Option<Watcher>>>,
 }
 
-/// What a change of one key means.
+/// Effects of a change of one key.
 #[derive(Default)]
 struct PlannedChanges {
     /// Parameters of running nodes.
@@ -65,7 +66,7 @@ impl PlannedChanges {
         }
         let owner = nodes.owner(&key);
         if let Some((node, rest)) = owner.filter(|(_, rest)| !rest.is_empty()) {
-            return self.nodes.entry(node.to_owned()).or_default().add(to_name(rest), value);
+            return self.nodes.entry(node.to_owned()).or_default().add(spell_in_ros2(rest), value);
         }
         let is_node = owner.is_some();
         match value {
@@ -105,6 +106,11 @@ impl ParameterServerView {
         (private, simulated)
     }
 
+    /// Returns the bus of the servant.
+    pub(super) fn bus(&self) -> &Arc<dyn Bus> {
+        &self.inner
+    }
+
     fn nodes(&self) -> ParameterNodes {
         ParameterNodes::of_bus(&*self.inner)
     }
@@ -137,7 +143,7 @@ impl ParameterServerView {
         let nodes = self.nodes();
         let kept = self.kept.get(key);
         if let Some((node, rest)) = nodes.owner(key).filter(|(_, rest)| !rest.is_empty()) {
-            let tree = self.read_node(node, &to_name(rest)).await?;
+            let tree = self.read_node(node, &spell_in_ros2(rest)).await?;
             return Ok(match (kept, value_at(&tree, rest)) {
                 (Some(ParamValue::Map(mut kept)), Some(ParamValue::Map(live))) => {
                     live.iter().for_each(|(entry, value)| put_at(&mut kept, entry, value.clone()));
@@ -167,7 +173,7 @@ impl ParameterServerView {
                         let reason = format!("all parameters together take more than {MAX_BYTES} bytes");
                         return Err(BusError::Protocol { what: format!("parameters below {key}"), reason });
                     }
-                    match (below(&node, key), values) {
+                    match (strip_parent(&node, key), values) {
                         (Some(path), values) => put_at(&mut tree, path, values),
                         (None, ParamValue::Map(values)) => {
                             values.into_iter().for_each(|(entry, value)| put_at(&mut tree, &entry, value));
@@ -184,7 +190,7 @@ impl ParameterServerView {
     }
 
     /// Sets parameters of a running node.
-    async fn set_at_node(&self, node: &str, values: NodeValues, refused: &mut RefusedParameters) {
+    pub(super) async fn set_at_node(&self, node: &str, values: NodeValues, refused: &mut RefusedParameters) {
         for (name, refusal) in &values.refused {
             refused.add(&shown_key(node, name), refusal);
         }
@@ -305,7 +311,7 @@ impl GlobalParameters for ParameterServerView {
                 None => BusError::NoParam(key),
             });
         };
-        let name = to_name(rest);
+        let name = spell_in_ros2(rest);
         let tree = self.read_node(node, &name).await?;
         let mut values = NodeValues::default();
         match value_at(&tree, rest) {

@@ -15,8 +15,11 @@
 
 use std::collections::BTreeMap;
 
-use ros::bus::ParamValue;
+use ros::bus::parameter_names::spell_in_ros2;
+use ros::bus::{ParamValue, ParameterKind};
+use ros::codec::put::CdrWriter;
 use ros::ros1::xmlrpc::MAX_DEPTH;
+use ros::ros2::parameters::values::{self, TypedValue};
 
 /// Reasons why a value of one ROS is none in the other.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -26,7 +29,7 @@ pub enum ParameterRefusal {
         "a list of {0} cannot be a ROS 2 parameter, whose lists hold bools, numbers or strings; use one list for each"
     )]
     ListOf(
-        /// What the list holds.
+        /// Type of the list's elements.
         &'static str,
     ),
     /// Nil, which ROS 1 does not define.
@@ -78,7 +81,7 @@ impl NodeValues {
         if let ParamValue::Map(entries) = value {
             for (entry, value) in entries {
                 // A dictionary of XML-RPC has any keys.
-                self.add(format!("{name}.{}", to_part(&entry)), value);
+                self.add(format!("{name}.{}", spell_in_ros2(&entry)), value);
             }
             return;
         }
@@ -87,10 +90,6 @@ impl NodeValues {
             Err(refusal) => self.refused.push((name, refusal)),
         }
     }
-}
-
-fn to_part(entry: &str) -> String {
-    entry.replace('/', ".")
 }
 
 fn check_for_ros2(name: &str, value: &ParamValue) -> Result<(), ParameterRefusal> {
@@ -125,6 +124,12 @@ pub(super) fn check_for_ros1(value: &ParamValue) -> Result<(), ParameterRefusal>
         ParamValue::Nil => Err(ParameterRefusal::Nil),
         _ => Ok(()),
     }
+}
+
+/// Writes a value into a message of ROS 2. One that is missing, or that ROS 2 does not have, is not set.
+pub(super) fn write_typed(value: Option<ParamValue>, put: &mut CdrWriter) {
+    let typed = value.and_then(|value| values::coerce(value, ParameterKind::NotSet).ok());
+    values::write(&typed.unwrap_or(TypedValue::NotSet), put);
 }
 
 /// A tree of values as a Master holds it.
@@ -182,6 +187,8 @@ pub(super) fn value_at<'t>(tree: &'t Tree, path: &str) -> Option<&'t ParamValue>
 
 #[cfg(test)]
 mod tests {
+    use ros::bus::parameter_names::spell_in_ros1;
+
     use super::*;
 
     fn value(json: &str) -> ParamValue {
@@ -224,7 +231,7 @@ mod tests {
         assert_eq!(names, ["a.b.c", "a.gains.i.x", "a.gains.p"]);
         let mut tree = Tree::new();
         for (name, value) in carried.values {
-            put_at(&mut tree, &name.replace('.', "/"), value);
+            put_at(&mut tree, &spell_in_ros1(&name), value);
         }
         assert_eq!(ParamValue::Map(tree), value(r#"{"a": {"gains": {"p": 1, "i": {"x": 2}}, "b": {"c": 3}}}"#));
     }

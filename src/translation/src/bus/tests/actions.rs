@@ -7,7 +7,7 @@ use tokio::sync::mpsc;
 
 use super::*;
 
-fn count(version: RosVersion) -> Arc<ActionDef> {
+pub(super) fn count(version: RosVersion) -> Arc<ActionDef> {
     definitions(version).action("x_msgs/Count").expect("an action")
 }
 

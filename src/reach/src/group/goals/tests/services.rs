@@ -22,7 +22,7 @@ use crate::memory_bus::MemorySystem;
 
 /// Budget of each robot.
 const BYTES: usize = 1 << 20;
-const LONG: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(60);
 const SEND: &str = "/count/_action/send_goal";
 const CANCEL: &str = "/count/_action/cancel_goal";
 const RESULT: &str = "/count/_action/get_result";
@@ -142,7 +142,7 @@ impl Robot {
     async fn send_goal(&self, number: u8, data: &str) -> Result<bool, BusError> {
         let of = &self.of.services.as_ref().expect("of ROS 2").send_goal;
         let goal = json!({ "goal_id": id(number), "goal": { "data": data } });
-        let answer = self.bus.call(SEND, cdr(&of.request, &goal), LONG).await?;
+        let answer = self.bus.call(SEND, cdr(&of.request, &goal), PATIENCE).await?;
         Ok(read(&of.response, &answer)["accepted"] == true)
     }
 
@@ -150,7 +150,7 @@ impl Robot {
     async fn cancel_goals(&self, number: u8) -> (Vec<u8>, u64) {
         let service = self.registry_service("action_msgs/srv/CancelGoal");
         let wanted = json!({ "goal_info": { "goal_id": id(number) } });
-        let answer = self.bus.call(CANCEL, cdr(&service.request, &wanted), LONG);
+        let answer = self.bus.call(CANCEL, cdr(&service.request, &wanted), PATIENCE);
         let answer = read(&service.response, &answer.await.expect("an answer"));
         let goals = answer["goals_canceling"].as_array().expect("goals");
         let number = |goal: &Value| (1..9).find(|number| goal["goal_id"] == id(*number));
@@ -167,7 +167,7 @@ impl Robot {
     async fn result(&self, number: u8) -> (u64, i64) {
         let of = &self.of.services.as_ref().expect("of ROS 2").get_result;
         let request = cdr(&of.request, &json!({ "goal_id": id(number) }));
-        let answer = self.bus.call(RESULT, request, LONG).await;
+        let answer = self.bus.call(RESULT, request, PATIENCE).await;
         let answer = read(&of.response, &answer.expect("an answer"));
         (answer["status"].as_u64().unwrap_or_default(), answer["result"]["all"].as_i64().unwrap_or_default())
     }
@@ -328,7 +328,7 @@ async fn goals_of_a_robot_whose_place_ended_keep_no_servant_from_others() {
             tokio::task::yield_now().await;
         }
     };
-    timeout(LONG, ended).await.expect("it is cancelled");
+    timeout(PATIENCE, ended).await.expect("it is cancelled");
 }
 
 #[tokio::test]

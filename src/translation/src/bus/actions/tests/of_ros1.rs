@@ -56,7 +56,7 @@ impl Robot {
     async fn send(&self, number: u8) -> Result<bool, BusError> {
         let of = &self.of.services.as_ref().expect("of ROS 2").send_goal;
         let goal = json!({ "goal_id": uuid(number), "goal": { "order": 7 } });
-        let answer = self.bus.call(SEND, write(&of.request, &goal), LONG).await?;
+        let answer = self.bus.call(SEND, write(&of.request, &goal), PATIENCE).await?;
         Ok(read(&of.response, &answer)["accepted"] == true)
     }
 
@@ -64,7 +64,7 @@ impl Robot {
     async fn cancel(&self, number: u8) -> (usize, u64) {
         let of = self.known.service("action_msgs/srv/CancelGoal").expect("known to all");
         let wanted = json!({ "goal_info": { "goal_id": uuid(number) } });
-        let answer = self.bus.call(CANCEL, write(&of.request, &wanted), LONG).await.expect("an answer");
+        let answer = self.bus.call(CANCEL, write(&of.request, &wanted), PATIENCE).await.expect("an answer");
         let answer = read(&of.response, &answer);
         let ending = answer["goals_canceling"].as_array().expect("goals").len();
         (ending, answer["return_code"].as_u64().expect("a code"))
@@ -74,7 +74,7 @@ impl Robot {
     async fn result(&self, number: u8) -> (u64, i64) {
         let of = &self.of.services.as_ref().expect("of ROS 2").get_result;
         let request = write(&of.request, &json!({ "goal_id": uuid(number) }));
-        let answer = self.bus.call(RESULT, request, LONG).await.expect("an answer");
+        let answer = self.bus.call(RESULT, request, PATIENCE).await.expect("an answer");
         let answer = read(&of.response, &answer);
         (answer["status"].as_u64().expect("a status"), answer["result"]["sum"].as_i64().expect("a result"))
     }
@@ -97,7 +97,7 @@ impl World {
     }
 }
 
-fn ended(outcome: GoalOutcome) -> Result<GoalEnd, GoalError> {
+fn goal_end(outcome: GoalOutcome) -> Result<GoalEnd, GoalError> {
     end(RosVersion::One, outcome)
 }
 
@@ -113,7 +113,7 @@ async fn goals_feedback_and_results_are_translated() {
     let heard = feedback.messages.try_recv().expect("feedback");
     assert_eq!(heard.publisher.node(), "/counter");
     assert_eq!(read(&robot.of.action_feedback, &heard.bytes)["feedback"], json!({ "part": 3 }));
-    events.on_ended(ended(GoalOutcome::Succeeded));
+    events.on_ended(goal_end(GoalOutcome::Succeeded));
     assert_eq!(robot.result(1).await, (SUCCEEDED, 9));
     assert_eq!(robot.result(1).await, (SUCCEEDED, 9), "it is kept for who asks late");
 }
@@ -124,16 +124,16 @@ async fn ends_become_those_of_ros_2() {
     let robot = Robot::new(&world);
     let gone = || Err(GoalError::ServerGone("/count".to_owned()));
     for (number, (listed, end, expected)) in [
-        (true, ended(GoalOutcome::Succeeded), SUCCEEDED),
-        (true, ended(GoalOutcome::Canceled), CANCELED),
-        (true, ended(GoalOutcome::Aborted), ABORTED),
-        (true, ended(GoalOutcome::Unknown), ABORTED),
+        (true, goal_end(GoalOutcome::Succeeded), SUCCEEDED),
+        (true, goal_end(GoalOutcome::Canceled), CANCELED),
+        (true, goal_end(GoalOutcome::Aborted), ABORTED),
+        (true, goal_end(GoalOutcome::Unknown), ABORTED),
         // It was listed as pending first.
-        (true, ended(GoalOutcome::Rejected), ABORTED),
+        (true, goal_end(GoalOutcome::Rejected), ABORTED),
         (true, gone(), ABORTED),
         // The result comes before any status.
-        (false, ended(GoalOutcome::Succeeded), SUCCEEDED),
-        (false, ended(GoalOutcome::Canceled), CANCELED),
+        (false, goal_end(GoalOutcome::Succeeded), SUCCEEDED),
+        (false, goal_end(GoalOutcome::Canceled), CANCELED),
     ]
     .into_iter()
     .enumerate()
@@ -174,16 +174,16 @@ async fn a_cancel_is_answered_by_the_status_or_by_the_end() {
         assert!(world.send(&robot, number, |events| events.on_accepted()).await);
     }
     let (answer, ()) = tokio::join!(robot.cancel(1), async {
-        world.server.cancelled(&text_id(1)).await;
+        world.server.wait_cancelled(&text_id(1)).await;
         // The status lists it as preempting.
         world.events(1).on_cancel_response(true);
     });
     assert_eq!(answer, (1, 0));
-    world.events(1).on_ended(ended(GoalOutcome::Canceled));
+    world.events(1).on_ended(goal_end(GoalOutcome::Canceled));
     assert_eq!(robot.result(1).await, (CANCELED, 9));
     let (answer, ()) = tokio::join!(robot.cancel(0), async {
-        world.server.cancelled(&text_id(2)).await;
-        world.events(2).on_ended(ended(GoalOutcome::Succeeded));
+        world.server.wait_cancelled(&text_id(2)).await;
+        world.events(2).on_ended(goal_end(GoalOutcome::Succeeded));
     });
     assert_eq!(answer.0, 0, "it ended before");
     assert_eq!(robot.cancel(2).await, (0, 3), "it has ended");
@@ -197,10 +197,10 @@ async fn a_newer_goal_preempts_the_older_one_where_the_server_does_so() {
     assert!(world.send(&robot, 1, |events| events.on_accepted()).await);
     // A SimpleActionServer lists the newer goal as pending until it has preempted the older one.
     assert!(world.send(&robot, 2, |events| events.on_waiting()).await);
-    world.events(1).on_ended(ended(GoalOutcome::Canceled));
+    world.events(1).on_ended(goal_end(GoalOutcome::Canceled));
     world.events(2).on_accepted();
     assert_eq!(robot.result(1).await.0, CANCELED);
-    world.events(2).on_ended(ended(GoalOutcome::Succeeded));
+    world.events(2).on_ended(goal_end(GoalOutcome::Succeeded));
     assert_eq!(robot.result(2).await.0, SUCCEEDED);
 }
 

@@ -42,7 +42,7 @@ impl Robot {
 
     /// Returns the next result: id, status, text and the result itself.
     async fn next_result(&mut self) -> (String, ActionlibStatus, String, Bytes) {
-        let message = timeout(LONG, self.result.messages.recv()).await.expect("it comes").expect("a result");
+        let message = timeout(PATIENCE, self.result.messages.recv()).await.expect("it comes").expect("a result");
         let (state, body) = messages::read_state(&message.bytes).expect("a result");
         (state.goal.id, state.status, state.text, body)
     }
@@ -117,7 +117,7 @@ async fn cancels_reach_the_server_and_goals_of_two_clients_do_not_meet() {
     let (first, second) = (world.server.goal("one").await.1, world.server.goal("two").await.1);
     // Before the server has answered.
     one.cancel_goal("one");
-    world.server.cancelled("one").await;
+    world.server.wait_cancelled("one").await;
     assert_eq!(one.status("one"), Some(ActionlibStatus::Recalling));
     first.on_accepted();
     assert_eq!(two.status("one"), Some(ActionlibStatus::Preempting), "each sees all goals of the robot");
@@ -128,7 +128,7 @@ async fn cancels_reach_the_server_and_goals_of_two_clients_do_not_meet() {
     assert_eq!(*world.server.cancelled.lock(), ["one"]);
     // All.
     one.cancel_goal("");
-    world.server.cancelled("two").await;
+    world.server.wait_cancelled("two").await;
     second.on_ended(end(RosVersion::Two, GoalOutcome::Succeeded));
     two.next_result().await;
     assert_eq!(two.next_result().await.1, ActionlibStatus::Succeeded, "its server went on");
@@ -147,6 +147,22 @@ async fn goals_wait_for_the_server_in_their_order_and_can_be_cancelled_until_the
     world.server.ready.send_replace(true);
     world.server.goal("c").await;
     assert_eq!(*world.server.order.lock(), ["a", "c"]);
+}
+
+#[tokio::test]
+async fn goals_that_wait_for_the_server_are_charged_to_the_robot() {
+    let budget = Budget::new("the robot", 8 << 10);
+    let world = World::with_budget(RosVersion::Two, &budget);
+    let mut robot = Robot::new(&world).await;
+    (0..100).for_each(|number| robot.send(&number.to_string()));
+    let (id, status, text, _) = robot.next_result().await;
+    assert_eq!(status, ActionlibStatus::Rejected);
+    assert!(text.contains("the goals and results of actions"), "{id}: {text}");
+    let waiting = budget.used_bytes();
+    world.server.ready.send_replace(true);
+    let first_refused: usize = id.parse().expect("a number");
+    world.server.goal(&(first_refused - 1).to_string()).await;
+    assert!(budget.used_bytes() < waiting / 2, "{} of {waiting}", budget.used_bytes());
 }
 
 #[tokio::test(start_paused = true)]
@@ -183,6 +199,7 @@ async fn a_goal_that_cannot_be_carried_is_rejected_and_a_result_aborts_it() {
 async fn the_graph_has_the_five_topics() {
     let world = World::new(RosVersion::Two);
     let graph = world.wait_for_graph(|graph| graph.actions.contains_key("/count")).await;
+    assert!(world.bus.left_out().borrow().is_empty());
     let action = &graph.actions["/count"];
     assert_eq!((&*action.type_name, &*action.servers), ("x_msgs/Count", &["/counter".to_owned()][..]));
     assert_eq!(action.topics.len(), 5);
@@ -202,11 +219,9 @@ async fn topics_outlive_a_server_that_comes_back_but_not_its_type() {
     let world = World::new(RosVersion::Two);
     let mut robot = Robot::new(&world).await;
     world.servant.graph.send_replace(graph(RosVersion::Two, &[]));
-    world.wait_for_graph(|graph| !graph.actions.contains_key("/count")).await;
-    let mut left_out = world.bus.left_out();
-    let left_out = left_out.wait_for(|all| all.contains_key("action /count")).await.expect("followed").clone();
-    let reason = &left_out["action /count"].reason;
-    assert!(reason.contains("robot"), "{reason}");
+    let has_no_server = |graph: &Graph| graph.actions.get("/count").is_some_and(|action| action.servers.is_empty());
+    let shown = world.wait_for_graph(has_no_server).await;
+    assert_eq!(shown.topics["/count/result"].subscribers, ["/user"], "a server of the robot may take its place");
     robot.send("meanwhile");
     let (_, events) = world.server.goal("meanwhile").await;
     events.on_ended(end(RosVersion::Two, GoalOutcome::Succeeded));
@@ -230,7 +245,7 @@ async fn goals_are_cancelled_when_the_robot_has_gone() {
     world.server.goal("one").await;
     let World { bus, server, .. } = world;
     drop((robot, bus));
-    server.cancelled("one").await;
+    server.wait_cancelled("one").await;
 }
 
 #[tokio::test]

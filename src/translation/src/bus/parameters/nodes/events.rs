@@ -5,12 +5,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use async_trait::async_trait;
 use parking_lot::Mutex;
+use ros::bus::parameter_names::spell_in_ros2;
 use ros::bus::{Graph, ParamChange, ParamChangeReceiver, ParamValue, ParameterEvent, ParameterEvents};
 use tokio::sync::{mpsc, watch};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::super::names::{SIM_TIME, SIM_TIME_KEY, to_name};
+use super::super::names::{SIM_TIME, SIM_TIME_KEY};
 use super::super::values::{NodeValues, Tree};
+use super::known_values::KnownValues;
 
 /// Maximum number of events that wait for a slow receiver; as in rmw.
 const MAX_EVENTS: usize = 1000;
@@ -34,15 +36,16 @@ pub(super) struct MasterEvents {
 }
 
 impl MasterWatch {
-    /// Starts to forward changes, first to one receiver.
+    /// Starts to forward what differs from the known values, first to one receiver.
     pub(super) fn start(
         changes: ParamChangeReceiver,
+        known: KnownValues,
         graph: watch::Receiver<Arc<Graph>>,
         node: Option<&str>,
     ) -> (Self, MasterEvents) {
         let (sender, events) = EventSender::new(node);
         let receivers = Arc::new(Mutex::new(Some(vec![sender])));
-        let forwarding = tokio::spawn(forward(changes, graph, Arc::clone(&receivers)));
+        let forwarding = tokio::spawn(forward(changes, known, graph, Arc::clone(&receivers)));
         (Self { receivers, _forwarding: AbortOnDropHandle::new(forwarding) }, events)
     }
 
@@ -93,10 +96,12 @@ impl ParameterEvents for MasterEvents {
 
 async fn forward(
     mut changes: ParamChangeReceiver,
+    mut known: KnownValues,
     graph: watch::Receiver<Arc<Graph>>,
     receivers: Arc<Mutex<Option<Vec<EventSender>>>>,
 ) {
     while let Some(change) = changes.recv().await {
+        let Some(change) = known.select_change(change) else { continue };
         let now = graph.borrow().clone();
         for event in to_events(&now, change) {
             if let Some(all) = &mut *receivers.lock() {
@@ -111,7 +116,6 @@ async fn forward(
 /// Returns the events that a change at a Master means: of the node of the longest name above the key. A Master does not
 /// say whether a parameter is new; every set value counts as a changed one.
 fn to_events(graph: &Graph, (key, value): ParamChange) -> Vec<ParameterEvent> {
-    // A Master reports namespaces with a slash at the end.
     let key = key.trim_end_matches('/');
     if key == SIM_TIME_KEY {
         let changed = vec![(SIM_TIME.to_owned(), ParamValue::Bool(value == Some(ParamValue::Bool(true))))];
@@ -141,10 +145,10 @@ fn to_events(graph: &Graph, (key, value): ParamChange) -> Vec<ParameterEvent> {
     let mut values = NodeValues::default();
     match value {
         Some(ParamValue::Map(entries)) if rest.is_empty() => {
-            entries.into_iter().for_each(|(name, value)| values.add(to_name(&name), value));
+            entries.into_iter().for_each(|(name, value)| values.add(spell_in_ros2(&name), value));
         }
-        Some(value) if !rest.is_empty() => values.add(to_name(rest), value),
-        None if !rest.is_empty() => event.deleted.push(to_name(rest)),
+        Some(value) if !rest.is_empty() => values.add(spell_in_ros2(rest), value),
+        None if !rest.is_empty() => event.deleted.push(spell_in_ros2(rest)),
         // Which parameters the node had is not known.
         _ => {}
     }
@@ -214,7 +218,7 @@ mod tests {
     async fn each_receiver_gets_the_events_of_its_node_until_the_watch_ends() {
         let (teller, changes) = param_change_channel(&budget::Budget::without_limit());
         let (_graph, now) = watch::channel(Arc::new(graph(&["/a", "/b"])));
-        let (watch, mut all) = MasterWatch::start(changes, now, None);
+        let (watch, mut all) = MasterWatch::start(changes, KnownValues::default(), now, None);
         let mut one = watch.subscribe(Some("/b")).expect("it runs");
         for key in ["/a/x", "/b/y"] {
             teller.send(key.to_owned(), value("1")).expect("memory");

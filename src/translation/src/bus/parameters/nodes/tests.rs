@@ -10,7 +10,7 @@ use ros::{JoinOptions, schema::Registry};
 use tokio::net::TcpListener;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::super::reconfigure::{message_type, service_type};
+use super::super::reconfigure::{message as message_type, service as service_type};
 use super::*;
 
 const SEE: &str = "/camera/see";
@@ -145,7 +145,7 @@ async fn an_answer_has_a_limit_however_often_a_parameter_is_asked_for() {
     for refused in [
         servant.view.get(SEE, &names).await.err(),
         servant.view.describe(SEE, &names).await.err(),
-        servant.view.get(SEE, &vec!["none".to_owned(); (MAX_ANSWER / EACH) + 1]).await.err(),
+        servant.view.get(SEE, &vec!["none".to_owned(); (MAX_ANSWER / PARAMETER_OVERHEAD) + 1]).await.err(),
     ] {
         let refused = refused.expect("it is too long").to_string();
         assert!(refused.contains("ask for fewer parameters at once"), "{refused}");
@@ -265,10 +265,15 @@ async fn a_change_at_the_master_is_an_event_of_the_node() {
     let event = events.next().await.expect("an event");
     assert_eq!(event.changed, [("use_sim_time".to_owned(), value("true"))]);
     assert_eq!(servant.values(&["use_sim_time"]).await, [Some(value("true"))]);
-    // Another watcher of the Master replaces this one.
-    let _other = servant.bus.parameters().expect("a Master").watch().await.expect("a watch");
-    assert!(events.next().await.is_none());
-    let mut again = servant.view.watch(Some(SEE)).await.expect("a watch");
+    // Another watcher of the Master hears the same.
+    let mut other = servant.bus.parameters().expect("a Master").watch().await.expect("a watch");
     servant.set_at_master("/camera/see/rate", "4").await;
-    assert_eq!(again.next().await.expect("an event").changed, [("rate".to_owned(), value("4"))]);
+    assert_eq!(events.next().await.expect("an event").changed, [("rate".to_owned(), value("4"))]);
+    assert_eq!(other.recv().await, Some(("/camera/see/rate".to_owned(), Some(value("4")))));
+    // What dynamic_reconfigure writes again has not changed.
+    servant.set_at_master("/camera/see", r#"{"rate": 4, "gains": {"p": 3}, "mode": 1}"#).await;
+    assert_eq!(events.next().await.expect("an event").changed, [("mode".to_owned(), value("1"))]);
+    servant.bus.close().await;
+    assert!(events.next().await.is_none());
+    assert!(servant.view.watch(Some(SEE)).await.is_err());
 }

@@ -6,13 +6,15 @@ use std::sync::{Arc, LazyLock};
 use bytes::Bytes;
 use ros::bus::{BusError, ParamValue, RosVersion};
 use ros::codec::cursor::MessageCursor;
+use ros::ros2::process::yaml;
 use ros::schema::{MessageType, Registry, SchemaError, ServiceDef};
+use serde::Deserialize;
 
 /// Maximum size of a message in bytes, and number of values in it.
 const MAX_BYTES: usize = 4 << 20;
 const MAX_VALUES: usize = 20_000;
 
-static KNOWN: LazyLock<Result<Registry, SchemaError>> = LazyLock::new(|| {
+static MESSAGE_TYPES: LazyLock<Result<Registry, SchemaError>> = LazyLock::new(|| {
     let registry = Registry::for_version(RosVersion::One);
     for (key, text) in DEFINITIONS {
         registry.insert(key, text)?;
@@ -55,12 +57,17 @@ pub(crate) fn service() -> Result<Arc<ServiceDef>, BusError> {
 }
 
 fn look_up<T>(name: &str, find: impl FnOnce(&Registry) -> Result<T, SchemaError>) -> Result<T, BusError> {
-    let found = match &*KNOWN {
+    let found = match &*MESSAGE_TYPES {
         Ok(registry) => find(registry),
         Err(error) => Err(error.clone()),
     };
     found.map_err(|error| BusError::Protocol { what: name.to_owned(), reason: error.to_string() })
 }
+
+/// Name of the group that all parameters belong to, unless their server has others.
+const DEFAULT_GROUP: &str = "Default";
+/// Parent and number of that group, each 0.
+const PARENT_AND_ID: [u8; 8] = [0; 8];
 
 /// Type of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,7 +99,7 @@ impl ConfigKind {
 pub(crate) struct DescribedParameter {
     pub(crate) kind: ConfigKind,
     pub(crate) description: String,
-    /// The named values that it can have, as the server writes them; may be empty.
+    /// The named values that it can have, in words; may be empty.
     pub(crate) choices: String,
     /// Smallest and largest value of a number.
     pub(crate) range: Option<(f64, f64)>,
@@ -100,8 +107,8 @@ pub(crate) struct DescribedParameter {
 
 /// The parameters of a server.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct ConfigDescription {
-    pub(super) parameters: BTreeMap<String, DescribedParameter>,
+pub(crate) struct ConfigDescription {
+    pub(crate) parameters: BTreeMap<String, DescribedParameter>,
 }
 
 /// Values by name.
@@ -121,7 +128,7 @@ impl ConfigDescription {
             for _ in 0..reader.count()? {
                 let (name, kind) = (reader.text()?, reader.text()?);
                 reader.cursor.number::<4>()?;
-                let (description, choices) = (reader.text()?, reader.text()?);
+                let (description, choices) = (reader.text()?, describe_choices(reader.text()?));
                 // A type of a later version would be changed by nobody here.
                 if let Some(kind) = ConfigKind::from_name(&kind) {
                     parameters.insert(name, DescribedParameter { kind, description, choices, range: None });
@@ -141,6 +148,86 @@ impl ConfigDescription {
         }
         Some(Self { parameters })
     }
+
+    /// Returns the serialized `ConfigDescription` with these defaults, which are to have a value for each parameter.
+    pub(crate) fn serialize(&self, defaults: &Config) -> Bytes {
+        let mut out = Vec::new();
+        out.extend(1u32.to_le_bytes());
+        put_text(DEFAULT_GROUP, &mut out);
+        put_text("", &mut out);
+        out.extend((self.parameters.len() as u32).to_le_bytes());
+        for (name, parameter) in &self.parameters {
+            put_text(name, &mut out);
+            put_text(parameter.kind.name(), &mut out);
+            out.extend(0u32.to_le_bytes());
+            put_text(&parameter.description, &mut out);
+            put_text(&parameter.choices, &mut out);
+        }
+        out.extend(PARENT_AND_ID);
+        // Clients look for each parameter in each of the three.
+        out.extend(self.limits(DescribedParameter::largest).serialize_state());
+        out.extend(self.limits(DescribedParameter::smallest).serialize_state());
+        out.extend(defaults.serialize_state());
+        out.into()
+    }
+
+    fn limits(&self, of: fn(&DescribedParameter) -> ParamValue) -> Config {
+        let limits = self.parameters.iter().map(|(name, parameter)| (name.clone(), of(parameter)));
+        Config { values: limits.collect() }
+    }
+}
+
+/// The part of a parameter's edit method that is read.
+#[derive(Deserialize)]
+struct EditMethod {
+    #[serde(rename = "enum")]
+    choices: Vec<Choice>,
+}
+
+/// A value with a name.
+#[derive(Deserialize)]
+struct Choice {
+    name: String,
+    value: ParamValue,
+}
+
+/// Returns the named values of a parameter (`Slow = 0, Fast = 1`), or else its edit method as it is. Generators write a
+/// dictionary of Python, which is YAML, too. Text with aliases, which repeat other text at no cost, stays as it is.
+fn describe_choices(edit_method: String) -> String {
+    if edit_method.contains('*') {
+        return edit_method;
+    }
+    match serde_norway::from_str(&edit_method) {
+        Ok(EditMethod { choices }) if !choices.is_empty() => {
+            let choices = choices.iter().map(|choice| format!("{} = {}", choice.name, yaml(&choice.value)));
+            choices.collect::<Vec<_>>().join(", ")
+        }
+        _ => edit_method,
+    }
+}
+
+impl DescribedParameter {
+    /// Returns the smallest value. Types without an order have one as well.
+    fn smallest(&self) -> ParamValue {
+        let from = self.range.map(|(from, _)| from);
+        match self.kind {
+            ConfigKind::Bool => ParamValue::Bool(false),
+            ConfigKind::Integer => ParamValue::Int(from.map_or(i32::MIN, |from| from as i32).into()),
+            ConfigKind::Double => ParamValue::Double(from.unwrap_or(f64::NEG_INFINITY)),
+            ConfigKind::Text => ParamValue::String(String::new()),
+        }
+    }
+
+    /// Returns the largest value, likewise.
+    fn largest(&self) -> ParamValue {
+        let to = self.range.map(|(_, to)| to);
+        match self.kind {
+            ConfigKind::Bool => ParamValue::Bool(true),
+            ConfigKind::Integer => ParamValue::Int(to.map_or(i32::MAX, |to| to as i32).into()),
+            ConfigKind::Double => ParamValue::Double(to.unwrap_or(f64::INFINITY)),
+            ConfigKind::Text => ParamValue::String(String::new()),
+        }
+    }
 }
 
 impl Config {
@@ -149,8 +236,25 @@ impl Config {
         ConfigReader::new(bytes)?.config()
     }
 
-    /// Returns the serialized `Config`. Values that are neither bools, integers, texts nor doubles are left out.
+    /// Returns the serialized `Config` as clients send it, without groups. Values that are neither bools, integers,
+    /// texts nor doubles are left out.
     pub(crate) fn serialize(&self) -> Bytes {
+        let mut out = self.serialize_values();
+        out.extend(0u32.to_le_bytes());
+        out.into()
+    }
+
+    /// Returns the serialized `Config` as servers send it, with the state of the group that all parameters belong to.
+    pub(crate) fn serialize_state(&self) -> Bytes {
+        let mut out = self.serialize_values();
+        out.extend(1u32.to_le_bytes());
+        put_text(DEFAULT_GROUP, &mut out);
+        out.push(true.into());
+        out.extend(PARENT_AND_ID);
+        out.into()
+    }
+
+    fn serialize_values(&self) -> Vec<u8> {
         let mut lists: [(u32, Vec<u8>); 4] = Default::default();
         for (name, value) in &self.values {
             let at = match value {
@@ -177,9 +281,7 @@ impl Config {
             out.extend(count.to_le_bytes());
             out.extend(list);
         }
-        // No groups.
-        out.extend(0u32.to_le_bytes());
-        out.into()
+        out
     }
 }
 
@@ -300,6 +402,49 @@ mod tests {
     }
 
     #[test]
+    fn choices_are_told_in_words() {
+        for (edit_method, told) in [
+            ("", ""),
+            (
+                "{'enum_description': 'how fast: very?', 'enum': [{'srcline': 9, 'srcfile': '/x.cfg', 'name': 'Slow', \
+                 'type': 'int', 'value': 0, 'description': ''}, {'name': 'Fast', 'value': 3}]}",
+                "Slow = 0, Fast = 3",
+            ),
+            ("{'enum': [{'name': 'Left', 'value': 'l'}]}", "Left = \"l\""),
+            ("{'enum': []}", "{'enum': []}"),
+            ("[unlike", "[unlike"),
+        ] {
+            assert_eq!(describe_choices(edit_method.to_owned()), told);
+        }
+    }
+
+    #[test]
+    fn a_description_is_serialized_and_read_again() {
+        let parameter = |kind, range| DescribedParameter { kind, description: "x".into(), choices: "".into(), range };
+        let parameters = [
+            ("gain", parameter(ConfigKind::Double, Some((-1.0, 2.5)))),
+            ("gains/p", parameter(ConfigKind::Double, Some((f64::NEG_INFINITY, f64::INFINITY)))),
+            ("mode", parameter(ConfigKind::Integer, Some((0.0, 3.0)))),
+            ("on", parameter(ConfigKind::Bool, None)),
+            ("text", parameter(ConfigKind::Text, None)),
+        ];
+        let mut description =
+            ConfigDescription { parameters: parameters.map(|(name, it)| (name.to_owned(), it)).into() };
+        let bytes = description.serialize(&Config::default());
+        let of = message("dynamic_reconfigure/ConfigDescription").expect("a type");
+        validate(&of, &bytes).expect("a message");
+        assert_eq!(ConfigDescription::parse(&bytes).as_ref(), Some(&description));
+        // What has no limits has those of its type.
+        for parameter in description.parameters.values_mut() {
+            parameter.range = None;
+        }
+        let read = ConfigDescription::parse(&description.serialize(&Config::default())).expect("a description");
+        let ranges = ["gain", "mode", "on"].map(|name| read.parameters[name].range);
+        let whole = Some((i32::MIN.into(), i32::MAX.into()));
+        assert_eq!(ranges, [Some((f64::NEG_INFINITY, f64::INFINITY)), whole, None]);
+    }
+
+    #[test]
     fn values_are_serialized_and_read_again() {
         let values = [
             ("on", ParamValue::Bool(true)),
@@ -313,6 +458,9 @@ mod tests {
         let of = message("dynamic_reconfigure/Config").expect("a type");
         validate(&of, &bytes).expect("a message");
         assert_eq!(Config::parse(&bytes), Some(config));
+        let state = Config::default().serialize_state();
+        validate(&of, &state).expect("a message");
+        assert_eq!(Config::parse(&state), Some(Config::default()));
         let with_groups = serialize("dynamic_reconfigure/Config", r#"{"groups": [{"name": "Default", "id": 1}]}"#);
         assert_eq!(Config::parse(&with_groups), Some(Config::default()));
     }

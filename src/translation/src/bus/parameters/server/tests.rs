@@ -65,7 +65,7 @@ async fn a_parameter_is_no_deeper_than_at_a_master_whoever_names_it() {
     assert_eq!(servant.value("/").await, Some(ParamValue::Map(Tree::new())));
     // Nor does a node make a tree that cannot be walked.
     let node = servant.start(SEE, r#"{"rate": 2}"#).await;
-    let changes = vec![(deep[1..].replace('/', "."), Some(value("1")))];
+    let changes = vec![(spell_in_ros2(&deep[1..]), Some(value("1")))];
     NodeParameters::set(&*node, SEE, changes).await.expect("a node");
     assert_eq!(servant.value(SEE).await, Some(value(r#"{"rate": 2}"#)));
 }

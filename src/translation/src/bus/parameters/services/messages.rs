@@ -4,7 +4,9 @@ use bytes::Bytes;
 use ros::bus::{FailureReason, ParamChange, ParamValue, ParameterDescription, ParameterKind, ParameterNames};
 use ros::codec::put::CdrWriter;
 use ros::ros2::parameters::reading::ParameterReader;
-use ros::ros2::parameters::values::{self, TypedValue};
+use ros::ros2::parameters::values;
+
+use crate::bus::parameters::values::write_typed;
 
 /// Reads the names that are asked for; `None` if the request is truncated or too long.
 pub(super) fn read_names(request: &[u8]) -> Option<Vec<String>> {
@@ -37,10 +39,7 @@ pub(super) fn write_names(names: &ParameterNames) -> Bytes {
 pub(super) fn write_values(all: Vec<Option<ParamValue>>) -> Bytes {
     let mut put = CdrWriter::new();
     put.length(all.len());
-    for value in all {
-        let typed = value.and_then(|value| values::coerce(value, ParameterKind::NotSet).ok());
-        values::write(&typed.unwrap_or(TypedValue::NotSet), &mut put);
-    }
+    all.into_iter().for_each(|value| write_typed(value, &mut put));
     put.finish()
 }
 

@@ -1,10 +1,12 @@
 """Minds what many nodes mind: how old its input is, which transforms it was told, what time it is."""
 
 import time
+from threading import Event
 
 import rclpy
 from geometry_msgs.msg import PointStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.action.client import GoalStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
@@ -14,6 +16,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 from tf2_msgs.msg import TFMessage
+
+
+def wait_for(future):
+    done = Event()
+    future.add_done_callback(lambda _: done.set())
+    done.wait()
+    return future.result()
 
 
 class Crossing(Node):
@@ -32,6 +41,11 @@ class Crossing(Node):
         self.create_service(Trigger, "~/now", self.now)
         self.declare_parameter("label", "none")
         self.create_service(Trigger, "~/label", self.label)
+        # Whoever waits for the robot keeps no other from being answered.
+        self.group = ReentrantCallbackGroup()
+        self.create_service(Trigger, "~/send", self.send, callback_group=self.group)
+        self.create_service(Trigger, "~/stop", self.stop, callback_group=self.group)
+        self.arm = None
         # A goal is cancelled while it is carried out.
         self.acting = ActionServer(
             self,
@@ -69,6 +83,30 @@ class Crossing(Node):
     def label(self, _, response):
         response.success = True
         response.message = self.get_parameter("label").value
+        return response
+
+    def find_arm(self):
+        if self.arm is None:
+            self.arm = ActionClient(self, Fibonacci, "/robot/act", callback_group=self.group)
+        self.arm.wait_for_server()
+        return self.arm
+
+    def send(self, _, response):
+        goal = wait_for(self.find_arm().send_goal_async(Fibonacci.Goal(order=3)))
+        return self.tell(goal, GoalStatus.STATUS_SUCCEEDED, response)
+
+    def stop(self, _, response):
+        moves = Event()
+        sent = self.find_arm().send_goal_async(Fibonacci.Goal(order=1000000), lambda _: moves.set())
+        goal = wait_for(sent)
+        moves.wait()
+        wait_for(goal.cancel_goal_async())
+        return self.tell(goal, GoalStatus.STATUS_CANCELED, response)
+
+    def tell(self, goal, expected, response):
+        end = wait_for(goal.get_result_async())
+        response.success = end.status == expected
+        response.message = " ".join(str(number) for number in end.result.sequence)
         return response
 
     def act(self, goal):

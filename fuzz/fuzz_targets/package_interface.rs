@@ -1,0 +1,3 @@
+//! An interface in TOML.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(package, interface);

@@ -1,0 +1,3 @@
+//! A package.xml.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(package, manifest);

@@ -1,0 +1,3 @@
+//! A signature of a stub's archive.
+#![cfg_attr(fuzzing, no_main)]
+fuzz::target!(sign, signature);

@@ -1,0 +1,39 @@
+//! Metrics of the daemon's own process, under the names that Prometheus's client libraries give them, and of its heap.
+
+use procfs::process::Process;
+
+use super::exposition::{write_family, write_gauge};
+
+/// Writes the metrics of this process. Those that the kernel does not tell are missing.
+pub(super) fn write_process_metrics(out: &mut String) {
+    let Ok(process) = Process::myself() else {
+        return;
+    };
+    if let Ok(stat) = process.stat() {
+        let ticks = procfs::ticks_per_second() as f64;
+        let worked = (stat.utime + stat.stime) as f64 / ticks;
+        let rows = [(String::new(), worked)];
+        write_family(out, "process_cpu_seconds_total", "counter", "Processor time of the daemon.", rows);
+        if let Ok(booted) = procfs::boot_time_secs() {
+            let begin = booted as f64 + stat.starttime as f64 / ticks;
+            gauge(out, "process_start_time_seconds", "When the daemon started, in seconds since 1970.", begin);
+        }
+        let resident = (stat.rss * procfs::page_size()) as f64;
+        gauge(out, "process_resident_memory_bytes", "Resident memory of the daemon.", resident);
+    }
+    if let Ok(open) = process.fd_count() {
+        gauge(out, "process_open_fds", "Open descriptors of the daemon.", open as f64);
+    }
+    let limit = process.limits().map(|limits| limits.max_open_files.soft_limit);
+    if let Ok(procfs::process::LimitValue::Value(limit)) = limit {
+        gauge(out, "process_max_fds", "Limit of the daemon's open descriptors.", limit as f64);
+    }
+    if let Some(allocated) = servant::process::allocated_bytes() {
+        let help = "Memory that the daemon allocated and did not free.";
+        gauge(out, "cloudroid_heap_bytes", help, allocated as f64);
+    }
+}
+
+fn gauge(out: &mut String, name: &str, help: &str, value: f64) {
+    write_gauge(out, name, help, [(String::new(), value)]);
+}
