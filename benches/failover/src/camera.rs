@@ -579,7 +579,9 @@ fn report_commands(report: &mut BenchReport, plan: &CameraPlan, record: &CameraR
             let figure = report.figure(name, "ms", value(&ours));
             figure.relative_to("the same bytes by an idle TCP connection", value(&plain));
             if let Some(impairment) = phase.impairment {
-                figure.note(format!("the network's own delay is {} ms", 2 * impairment.delay));
+                let missing = ours.iter().filter(|time| time.is_infinite()).count();
+                let (delay, all) = (2 * impairment.delay, ours.len());
+                figure.note(format!("the network's own delay is {delay} ms; {missing} of {all} without echo"));
                 if percentile == "p99" && plan.local == "none" {
                     figure.require(Target::RatioAtMost(2.0));
                 }

@@ -212,7 +212,8 @@ impl<P: Clone> Governor<P> {
         }
         if !is_request {
             if self.forward_sides().local {
-                self.pairs[index].arrivals.note_given_locally(now);
+                let t_max = self.sla.times(topic).t_max;
+                self.pairs[index].arrivals.note_given_locally(now, now, t_max);
             }
             // The stamp was seen before, or, when matching by arrival, a request is outstanding already.
             return self.forward(topic, &payload);

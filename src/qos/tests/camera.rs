@@ -83,6 +83,8 @@ struct World {
     period: u64,
     /// One-way delay between robot and cloud, milliseconds.
     delay: u64,
+    /// One-way delay between robot and local original, milliseconds.
+    local_delay: u64,
     /// One picture in so many is lost on the way; zero for none.
     loses: u32,
     has_link: bool,
@@ -90,6 +92,8 @@ struct World {
     up: VecDeque<(u64, Sent)>,
     /// Answers, with the newest picture that the node had been given.
     down: VecDeque<(u64, [u32; 2])>,
+    to_local: VecDeque<(u64, Sent)>,
+    from_local: VecDeque<(u64, u32)>,
     /// Time at which the local original will be up, and whether it is.
     local_up: Option<u64>,
     is_local_up: bool,
@@ -125,11 +129,14 @@ impl World {
             is_by_stamp: by == "stamp",
             period: 33,
             delay: 0,
+            local_delay: 0,
             loses: 0,
             has_link: true,
             nodes: [node(), node()],
             up: VecDeque::new(),
             down: VecDeque::new(),
+            to_local: VecDeque::new(),
+            from_local: VecDeque::new(),
             local_up: None,
             is_local_up: false,
             pictures: 0,
@@ -197,7 +204,13 @@ impl World {
             let published = self.published[newest as usize - 1];
             self.answer(Responder::Cloud, number, Some(MS * (self.t - published) as u32));
         }
-        if let Some(number) = self.nodes[1].step(self.t).filter(|_| self.is_local_up) {
+        while let Some(sent) = pop_arrived(&mut self.to_local, self.t, self.is_local_up) {
+            self.nodes[1].receive(sent);
+        }
+        if let Some(number) = self.nodes[1].step(self.t) {
+            self.from_local.push_back((self.t + self.local_delay, number));
+        }
+        while let Some(number) = pop_arrived(&mut self.from_local, self.t, self.is_local_up) {
             self.answer(Responder::Local, number, None);
         }
         if self.t % FEEDBACK == 0 {
@@ -285,7 +298,7 @@ impl World {
                             self.up.push_back((self.t + self.delay, payload));
                         }
                     }
-                    Responder::Local => self.nodes[1].receive(payload),
+                    Responder::Local => self.to_local.push_back((self.t + self.local_delay, payload)),
                 },
                 Effect::Event(QosEvent::Start(_)) => self.local_up = Some(self.t + STARTS),
                 Effect::Event(QosEvent::Stop(_)) => self.stop_local(),
@@ -298,6 +311,8 @@ impl World {
     fn stop_local(&mut self) {
         (self.local_up, self.is_local_up) = (None, false);
         self.nodes[1].reset();
+        self.to_local.clear();
+        self.from_local.clear();
     }
 
     fn cut_link(&mut self) {
@@ -384,6 +399,28 @@ fn a_warm_original_steps_in_before_the_first_request_is_late() {
         assert_eq!((counts.unanswered_in_time, counts.safe_stops), (0, 0), "{by}, {takes} ms: {counts:?}");
         let twice = world.delivered.iter().find(|(_, by)| by[0] + by[1] > 1);
         assert_eq!(twice, None, "{by}, {takes} ms");
+    }
+}
+
+#[test]
+fn by_arrival_no_picture_is_answered_twice_around_a_cut() {
+    for (delay, takes) in [(0, 64), (20, 64), (60, 64), (20, 40), (20, 100), (20, 20)] {
+        for offset in 0..66 {
+            let mut world = World::with_pairs("warm", "arrival");
+            (world.delay, world.local_delay, world.nodes[1].takes) = (delay, 2, takes);
+            world.advance(2000 + offset);
+            for _ in 0..3 {
+                world.cut_link();
+                world.advance(1500);
+                let heard = world.heard.last().is_some_and(|at| world.t - at < T_MAX);
+                assert!(heard, "{delay} ms each way, {takes} ms, cut at {offset} ms: the original does not answer");
+                world.restore_link(true);
+                world.advance(1500 + offset);
+            }
+            let twice = world.delivered.iter().find(|(_, by)| by[0] + by[1] > 1);
+            assert_eq!(twice, None, "{delay} ms each way, {takes} ms, cut at {offset} ms");
+            assert_eq!(world.counts().safe_stops, 0, "{delay} ms each way, {takes} ms, cut at {offset} ms");
+        }
     }
 }
 

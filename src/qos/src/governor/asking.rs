@@ -18,7 +18,7 @@ impl<P: Clone> Governor<P> {
         });
         for side in sides.iter() {
             if by_arrival.is_some_and(|pair| !self.is_free(pair, side)) {
-                self.send_unawaited(id, side);
+                self.send_unawaited(now, id, side);
             } else {
                 self.ask(now, id, side);
             }
@@ -60,7 +60,7 @@ impl<P: Clone> Governor<P> {
             let stream = &mut self.pairs[pair];
             stream.queues[side.index()].add(id);
             if side == Responder::Local {
-                stream.arrivals.note_given_locally(record.asked_at);
+                stream.arrivals.note_given_locally(now, record.asked_at, record.deadline - record.asked_at);
             }
         }
         let channel = record.channel.clone();
@@ -69,13 +69,14 @@ impl<P: Clone> Governor<P> {
 
     /// Sends a request to a side that is busy with an earlier one: the side's next output will not be taken as the
     /// answer to this one.
-    fn send_unawaited(&mut self, id: RequestId, side: Responder) {
+    fn send_unawaited(&mut self, now: Instant, id: RequestId, side: Responder) {
         let Some(record) = self.arbiter.get_mut(id) else {
             return;
         };
         record.mark_left_out(side);
         if let (Kind::Input(pair), Responder::Local) = (record.kind, side) {
-            self.pairs[pair].arrivals.note_given_locally(record.asked_at);
+            let t_max = record.deadline - record.asked_at;
+            self.pairs[pair].arrivals.note_given_locally(now, record.asked_at, t_max);
         }
         if let Some(payload) = record.payload.clone() {
             let channel = record.channel.clone();
