@@ -1,5 +1,6 @@
 //! Metrics of the daemon's own process, under the names that Prometheus's client libraries give them, and of its heap.
 
+use nix::unistd::{SysconfVar, sysconf};
 use procfs::process::Process;
 
 use super::exposition::{write_family, write_gauge};
@@ -9,8 +10,8 @@ pub(super) fn write_process_metrics(out: &mut String) {
     let Ok(process) = Process::myself() else {
         return;
     };
-    if let Ok(stat) = process.stat() {
-        let ticks = procfs::ticks_per_second() as f64;
+    let units = (read_system_value(SysconfVar::CLK_TCK), read_system_value(SysconfVar::PAGE_SIZE));
+    if let (Ok(stat), (Some(ticks), Some(page_size))) = (process.stat(), units) {
         let worked = (stat.utime + stat.stime) as f64 / ticks;
         let rows = [(String::new(), worked)];
         write_family(out, "process_cpu_seconds_total", "counter", "Processor time of the daemon.", rows);
@@ -18,7 +19,7 @@ pub(super) fn write_process_metrics(out: &mut String) {
             let begin = booted as f64 + stat.starttime as f64 / ticks;
             gauge(out, "process_start_time_seconds", "When the daemon started, in seconds since 1970.", begin);
         }
-        let resident = (stat.rss * procfs::page_size()) as f64;
+        let resident = stat.rss as f64 * page_size;
         gauge(out, "process_resident_memory_bytes", "Resident memory of the daemon.", resident);
     }
     if let Ok(open) = process.fd_count() {
@@ -32,6 +33,12 @@ pub(super) fn write_process_metrics(out: &mut String) {
         let help = "Memory that the daemon allocated and did not free.";
         gauge(out, "cloudroid_heap_bytes", help, allocated as f64);
     }
+}
+
+/// Returns a value of sysconf(3). procfs would read it from the auxiliary vector, which Linux before 6.4 shows no process
+/// that gave up privileges, and panic.
+fn read_system_value(of: SysconfVar) -> Option<f64> {
+    Some(sysconf(of).ok()?? as f64)
 }
 
 fn gauge(out: &mut String, name: &str, help: &str, value: f64) {
