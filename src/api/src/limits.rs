@@ -1,4 +1,5 @@
-//! Resource limits and resource usage of servants.
+//! Resource limits and resource usage of servants. Limits are declared once, as fields of the API, flags of the command
+//! line and keys of the configuration.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,32 +21,42 @@ const LEAST_PIDS: u64 = 4;
 /// kept (in a change).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[cfg_attr(feature = "flags", derive(clap::Args))]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
-    /// CPU limit in cores, such as 1.5.
+    /// CPU limit in cores, such as 1.5, which is also reserved.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "N", value_parser = parse_cores))]
     pub cpus: Option<f64>,
-    /// Relative CPU share under contention, 1 to 10000 (default: 100).
+    /// CPU weight when cores are scarce, 1 to 10000 (default: 100).
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "N"))]
     pub cpu_weight: Option<u64>,
-    /// Memory limit, without swap.
+    /// CPUs that the servant may run on, such as 0-3,6; on cgroup v1 it can be changed only for a servant that was
+    /// started with it.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub memory: Option<Size>,
-    /// Memory above which the servant is throttled and reclaimed, before it is killed at `memory` (cgroup v2 only).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub memory_high: Option<Size>,
-    /// Maximum number of processes and threads.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub pids: Option<u64>,
-    /// Read bandwidth on the disk with the images, in bytes per second.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub io_read: Option<Size>,
-    /// Write bandwidth on the disk with the images, in bytes per second.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub io_write: Option<Size>,
-    /// CPUs that the servant may run on, such as `0-3,6`.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "CORES"))]
     pub cpuset: Option<CpuSet>,
+    /// Memory limit, without swap, which is also reserved, such as 512M.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "SIZE"))]
+    pub memory: Option<Size>,
+    /// Memory above which the servant is slowed down and its memory reclaimed (cgroup v2).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "SIZE"))]
+    pub memory_high: Option<Size>,
+    /// Largest number of processes and threads.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "N"))]
+    pub pids: Option<u64>,
+    /// Read rate on the disk with the images in bytes per second, such as 10M.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "SIZE"))]
+    pub io_read: Option<Size>,
+    /// Write rate on the disk with the images in bytes per second.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(long, value_name = "SIZE"))]
+    pub io_write: Option<Size>,
 }
 
 /// Combines two sets of limits field by field with a function of two options; the CPU set with another one, if given.
@@ -201,14 +212,23 @@ impl UnusableLimits {
 /// Upper limits on what robots may request.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[cfg_attr(feature = "flags", derive(clap::Args))]
 #[serde(default, deny_unknown_fields)]
 pub struct Caps {
-    /// Maximum CPU in cores.
+    /// Largest number of cores that a robot may request.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(id = "max-cpus", long, value_name = "N", value_parser = parse_cores))]
     pub cpus: Option<f64>,
-    /// Maximum memory.
+    /// Largest amount of memory that a robot may request, such as 2G.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "flags", arg(id = "max-memory", long, value_name = "SIZE"))]
     pub memory: Option<Size>,
+}
+
+#[cfg(feature = "flags")]
+fn parse_cores(text: &str) -> Result<f64, UnusableLimits> {
+    let cores = text.parse::<f64>().ok().filter(|cores| cores.is_finite() && *cores > 0.0);
+    cores.ok_or_else(|| UnusableLimits::new("write a number of cores such as 1.5".to_owned()))
 }
 
 impl Caps {

@@ -3,8 +3,9 @@
 use std::io::{Write, stderr, stdout};
 use std::process::ExitCode;
 
+use api::{Caps, Limits};
 use clap::error::ErrorKind;
-use clap::{Arg, ArgMatches, Command};
+use clap::{Arg, ArgMatches, Args, Command};
 
 use crate::colour::has_colours;
 use crate::output::terminal_width;
@@ -31,35 +32,15 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Daemon and shell", &["status", "doctor", "version", "completions", "man"]),
 ];
 
+/// Section of the options about servants, to which all limits belong.
+const SERVANTS: &str = "Servants";
+
 /// Options of `push` by what they are about; all others are under Options.
 const SECTIONS: [(&str, &[&str]); 5] = [
     ("What runs", &["launch", "node", "param", "arg", "remap"]),
     ("Build", &["base", "map", "with", "on", "as-underlay", "packages-up-to", "packages-skip", "cmake-args"]),
     ("Interface and requests", &["interface", "request", "stateful", "rrt", "max-rrt"]),
-    (
-        "Servants",
-        &[
-            "cpus",
-            "cpu-weight",
-            "cpuset",
-            "memory",
-            "memory-high",
-            "pids",
-            "io-read",
-            "io-write",
-            "max-cpus",
-            "max-memory",
-            "device",
-            "volume",
-            "egress",
-            "shared",
-            "min",
-            "max",
-            "idempotent",
-            "replicas",
-            "calls",
-        ],
-    ),
+    (SERVANTS, &["device", "volume", "egress", "shared", "min", "max", "idempotent", "replicas", "calls"]),
     ("Rollout", &["canary", "bound", "samples", "promote-after", "deadline", "wait"]),
 ];
 
@@ -90,10 +71,16 @@ fn assign_section(argument: Arg) -> Arg {
     let Some(long) = argument.get_long() else {
         return argument;
     };
-    match SECTIONS.iter().find(|(_, options)| options.contains(&long)) {
-        Some((section, _)) => argument.help_heading(*section),
+    let section = SECTIONS.iter().find(|(_, options)| options.contains(&long)).map(|(section, _)| *section);
+    match section.or_else(|| is_limit(long).then_some(SERVANTS)) {
+        Some(section) => argument.help_heading(section),
         None => argument,
     }
+}
+
+fn is_limit(long: &str) -> bool {
+    let limits = Caps::augment_args(Limits::augment_args(Command::new("limits")));
+    limits.get_arguments().any(|argument| argument.get_long() == Some(long))
 }
 
 /// Returns the template of the main help, with the verbs in groups.

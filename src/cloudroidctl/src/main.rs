@@ -26,7 +26,6 @@ mod goals;
 mod help;
 mod import;
 mod inside;
-mod limits;
 mod logs;
 mod manual;
 mod moment;

@@ -273,9 +273,6 @@ pub fn limits(limits: &Limits) -> String {
             "cpu-weight" => None,
             "cpuset" => Some(format!("on cores {value}")),
             "memory" => Some(value),
-            "memory-high" => Some(format!("high {value}")),
-            "io-read" => Some(format!("read {value}/s")),
-            "io-write" => Some(format!("write {value}/s")),
             name => Some(format!("{name} {value}")),
         })
         .collect();

@@ -12,10 +12,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use api::push::ParsePairError;
-use api::{Grants, PushOptions, ServiceDetail, Sla, Span, Volume};
+use api::{Caps, Grants, Limits, PushOptions, ServiceDetail, Sla, Span, Volume};
 
 use crate::client::{DaemonClient, RequestBody, percent_encode};
-use crate::limits::{CapFlags, LimitFlags};
 use crate::output::{self, OutputFormat};
 use crate::push::shared::SharedFlags;
 use crate::rollout::{self, TermFlags};
@@ -117,9 +116,9 @@ pub struct PushArgs {
     #[arg(long, conflicts_with = "wait")]
     detach: bool,
     #[command(flatten)]
-    limits: LimitFlags,
+    limits: Limits,
     #[command(flatten)]
-    caps: CapFlags,
+    caps: Caps,
     /// T_desire for robots that state no times, such as 100ms.
     #[arg(long, value_name = "TIME")]
     rrt: Option<Span>,
@@ -285,8 +284,8 @@ impl PushArgs {
             on: self.on.clone(),
             as_underlay: self.as_underlay.clone(),
             cmake_args: self.cmake_args.iter().flat_map(|text| text.split_whitespace()).map(str::to_owned).collect(),
-            limits: self.limits.into(),
-            caps: self.caps.into(),
+            limits: self.limits,
+            caps: self.caps,
             sla: Sla { rrt: self.rrt, max_rrt: self.max_rrt, ..Sla::default() },
             grants: Grants {
                 devices: self.devices.clone(),

@@ -5,7 +5,6 @@ use api::{Limits, Servant};
 
 use crate::client::{DaemonClient, percent_encode};
 use crate::inside;
-use crate::limits::LimitFlags;
 use crate::output::{self, OutputFormat};
 
 /// Change limits of a running servant, and what is reserved for it. Limits that are not named stay the same.
@@ -14,13 +13,13 @@ pub struct SetArgs {
     /// Id of the servant, or name of a service that has one servant.
     servant: String,
     #[command(flatten)]
-    limits: LimitFlags,
+    limits: Limits,
 }
 
 impl SetArgs {
     /// Sends the request and prints the limits in force.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let limits = Limits::from(self.limits);
+        let limits = self.limits;
         if limits == Limits::default() {
             bail!("nothing to change; name a limit, such as --cpus 1.5 or --memory 512M");
         }

@@ -8,7 +8,6 @@ use api::sla::ParseValueError;
 use api::{Limits, Measure};
 
 use crate::client::{DaemonClient, percent_encode};
-use crate::limits::LimitFlags;
 use crate::output::{self, OutputFormat, Table};
 use crate::terms_flags::{StatedFlags, aux, to_query, unique_aux};
 
@@ -54,7 +53,7 @@ struct SetRow {
     #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
     #[command(flatten)]
-    limits: LimitFlags,
+    limits: Limits,
     /// Measurement of the entry: p50, p95 and number of requests, such as 80ms,95ms,200.
     #[arg(long, value_name = "P50,P95,N")]
     spread: Option<String>,
@@ -145,7 +144,7 @@ impl SetRow {
         let Some((measure, value)) = given else {
             bail!("no goal given; pass --rrt, --fps or --age");
         };
-        let limits = Limits::from(self.limits);
+        let limits = self.limits;
         if limits == Limits::default() {
             bail!("no limits given; pass one, such as --cpus 1.5 or --memory 512M");
         }

@@ -1,10 +1,10 @@
 //! Inputs that are matched by arrival, in the order in which they came.
 //!
 //! Nothing says which of them an output answers. It is none that its node had not been given yet, and, of a node that
-//! skips inputs while it is busy, possibly the newest one at its previous output. The local original is assumed to take
-//! an input when it has none, else the newest one once it has answered (the next one, if its node skips none). An output
-//! is taken for a repetition if the other side has delivered an answer to an input at or after the oldest one that it
-//! may answer.
+//! skips inputs while it is busy, possibly the newest one at its previous output. The local original is assumed to
+//! take an input when it has none, else the newest one once it has answered (the next one, if its node skips none).
+//! An output is taken for a repetition if the other side has delivered an answer to an input at or after the oldest
+//! one that it may answer.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
