@@ -35,8 +35,8 @@ pub(super) fn write_process_metrics(out: &mut String) {
     }
 }
 
-/// Returns a value of sysconf(3). procfs would read it from the auxiliary vector, which Linux before 6.4 does not show a
-/// process that gave up privileges, and panic.
+/// Returns a value of sysconf(3). procfs would read it from the auxiliary vector, which Linux before 6.4 does not show
+/// a process that gave up privileges, and panic.
 fn read_system_value(of: SysconfVar) -> Option<f64> {
     Some(sysconf(of).ok()?? as f64)
 }
