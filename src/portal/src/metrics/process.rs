@@ -15,8 +15,8 @@ pub(super) fn write_process_metrics(out: &mut String) {
         let worked = (stat.utime + stat.stime) as f64 / ticks;
         let rows = [(String::new(), worked)];
         write_family(out, "process_cpu_seconds_total", "counter", "Processor time of the daemon.", rows);
-        if let Ok(booted) = procfs::boot_time_secs() {
-            let begin = booted as f64 + stat.starttime as f64 / ticks;
+        if let Some(booted) = read_boot_time() {
+            let begin = booted + stat.starttime as f64 / ticks;
             gauge(out, "process_start_time_seconds", "When the daemon started, in seconds since 1970.", begin);
         }
         let resident = stat.rss as f64 * page_size;
@@ -35,10 +35,18 @@ pub(super) fn write_process_metrics(out: &mut String) {
     }
 }
 
-/// Returns a value of sysconf(3). procfs would read it from the auxiliary vector, which Linux before 6.4 does not show
-/// a process that gave up privileges, and panic.
+// procfs would read units, and the boot time with them, by the auxiliary vector, which Linux before 6.4 does not show
+// a process that gave up privileges, and panic.
+
+/// Returns a value of sysconf(3).
 fn read_system_value(of: SysconfVar) -> Option<f64> {
     Some(sysconf(of).ok()?? as f64)
+}
+
+/// Returns when the host started, in seconds since 1970 (`btime` of proc_stat(5)).
+fn read_boot_time() -> Option<f64> {
+    let stat = std::fs::read_to_string("/proc/stat").ok()?;
+    stat.lines().find_map(|line| line.strip_prefix("btime "))?.trim().parse().ok()
 }
 
 fn gauge(out: &mut String, name: &str, help: &str, value: f64) {
