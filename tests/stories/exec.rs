@@ -227,7 +227,7 @@ pub fn who_may_not_is_refused_and_who_may_no_longer_is_ended() -> Verdict {
     let object = format!("servant {servant} of robot r1 at service adder_py: echo here");
     wait_for_record(&daemon, "alice (deployer)", "start a program", &object, 101)?;
     wait_for_record(&daemon, "alice (deployer)", "end of a program", &format!("{object}: exit status 0"), 200)?;
-    // Who leaves before the program has started is recorded all the same.
+    // Who leaves before the program has started is recorded all the same; who leaves before the answer started none.
     let hasty = format!(
         "GET /api/v1/servants/{servant}/exec?argument=sleep&argument=4716 HTTP/1.1\r\nHost: {address}\r\n\
             Authorization: Bearer {alice}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
@@ -235,7 +235,12 @@ pub fn who_may_not_is_refused_and_who_may_no_longer_is_ended() -> Verdict {
             Sec-WebSocket-Protocol: exec.v1.cloudroid\r\n\r\n",
         address = daemon.address
     );
-    TcpStream::connect(&daemon.address)?.write_all(hasty.as_bytes())?;
+    let mut leaver = TcpStream::connect(&daemon.address)?;
+    leaver.write_all(hasty.as_bytes())?;
+    let mut status = [0; 12];
+    leaver.read_exact(&mut status)?;
+    ensure!(status == *b"HTTP/1.1 101", "{}", String::from_utf8_lossy(&status));
+    drop(leaver);
     let words = "sleep 4716: killed: the connection ended";
     wait_for_record(&daemon, "alice (deployer)", "end of a program", words, 200)?;
     wait_until_gone(&daemon, &servant, "sleep 4716")?;
