@@ -29,12 +29,19 @@ pub fn processes_of(home: &Path) -> Vec<i32> {
         let command = procfs::command_line(*pid).unwrap_or_default();
         let directory = fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
         let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
-        command.contains(&home)
+        names_directory(&command, &home)
             || directory.starts_with(&home)
             // Processes in this mount namespace see the same mounts without using them.
             || (procfs::namespace(*pid, "mnt") != namespace && mounted.contains(&format!("{home}/")))
     };
     procfs::pids().into_iter().filter(|pid| *pid != own).filter(refers).collect()
+}
+
+/// Returns whether a command line names a directory or something below it, and not only another one whose name begins
+/// with its name.
+fn names_directory(command: &str, directory: &str) -> bool {
+    let continues = |next: char| next.is_alphanumeric() || ['-', '_', '.'].contains(&next);
+    command.match_indices(directory).any(|(at, _)| !command[at + directory.len()..].starts_with(continues))
 }
 
 /// Detaches all mounts below a directory in this mount namespace, the innermost first.
